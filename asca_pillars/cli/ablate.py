@@ -18,13 +18,30 @@ def ablate(
         ),
     ],
     *,
-    data: Annotated[Path, typer.Option("--data", "-d", help="KITTI-layout folder with ImageSets/{train,val}.txt.")],
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder of the runs; finished ones there are kept.")],
+    data: Annotated[
+        Path,
+        typer.Option(
+            "--data", "-d", help="KITTI-layout folder with ImageSets/{train,val}.txt.", rich_help_panel="Input"
+        ),
+    ],
     override: OverridesOption = None,
-    seeds: Annotated[str, typer.Option("--seeds", help="Seeds of every variant, with commas between them.")] = "0,1",
-    variants: Annotated[str, typer.Option("--variants", help="Names with commas between them, or all.")] = "all",
+    seeds: Annotated[
+        str, typer.Option("--seeds", help="Seeds of every variant, with commas between them.", rich_help_panel="Input")
+    ] = "0,1",
+    variants: Annotated[
+        str, typer.Option("--variants", help="Names with commas between them, or all.", rich_help_panel="Input")
+    ] = "all",
     init: InitOption = None,
-    jobs: Annotated[int, typer.Option("--jobs", min=1, help="Trainings at a time; they share the CPU cores.")] = 1,
+    out: Annotated[
+        Path,
+        typer.Option("--out", "-o", help="Folder of the runs; finished ones there are kept.", rich_help_panel="Output"),
+    ],
+    jobs: Annotated[
+        int,
+        typer.Option(
+            "--jobs", min=1, help="Trainings at a time; they share the CPU cores.", metavar="N", rich_help_panel="Speed"
+        ),
+    ] = 1,
 ) -> None:
     """Train and compare: with and without ASP, CPA, GT-Aug and RS-Aug, other K, the readings of CPA; write one table.
 

@@ -15,9 +15,10 @@ from asca_pillars.cli.options import (
     PrecisionOption,
     ProviderOption,
     ReflectanceScaleOption,
-    ScansArgument,
+    ScansOrRecordingArgument,
     SensorHeightOption,
     ThreadsOption,
+    TopicOption,
     scan_settings,
 )
 
@@ -25,39 +26,67 @@ MOST_SCANS = 100  # they are held in memory, and every round goes over all of th
 
 
 def bench(
-    scans: ScansArgument = None,
+    scans: ScansOrRecordingArgument = None,
     *,
     bundle: BundleOption = None,
-    provider: ProviderOption = "cpu",
-    precision: PrecisionOption = None,
-    threads: ThreadsOption = None,
-    rounds: Annotated[int, typer.Option("--rounds", min=1, help="Timed passes over the scans, for each table.")] = 30,
     compare: Annotated[
         list[Path] | None,
         typer.Option(
             "--compare",
             help="Another bundle, run in turn with the first on the same scans: how many times as fast it is, with "
             "quartiles over the rounds. Such ratios hold on a busy machine, times do not. Repeatable.",
+            rich_help_panel="Input",
         ),
     ] = None,
+    around: AroundOption = False,
+    sensor_height: SensorHeightOption = None,
+    axes: AxesOption = "x-forward",
+    pose: PoseOption = None,
+    reflectance_scale: ReflectanceScaleOption = "auto",
+    columns: ColumnsOption = None,
+    topic: TopicOption = None,
+    rounds: Annotated[
+        int,
+        typer.Option(
+            "--rounds",
+            min=1,
+            help="Timed passes over the scans, for each table.",
+            metavar="N",
+            rich_help_panel="Measurements",
+        ),
+    ] = 30,
     matrix: Annotated[
         bool,
         typer.Option(
             "--matrix",
             help="Every provider, precision and number of threads in turn (of the --compare bundles too): speed, and "
             "how far the boxes are from float32 on the stock CPU provider. What cannot run says why.",
+            rich_help_panel="Measurements",
         ),
     ] = False,
     scaling: Annotated[
-        bool, typer.Option("--scaling", help="Each stage at 1,000 to 1,000,000 points, made from the first scan.")
+        bool,
+        typer.Option(
+            "--scaling",
+            help="Each stage at 1,000 to 1,000,000 points, made from the first scan.",
+            rich_help_panel="Measurements",
+        ),
     ] = False,
     stream: Annotated[
         bool,
-        typer.Option("--stream", help="Scans per second and latency of detector.stream(scans) beside single calls."),
+        typer.Option(
+            "--stream",
+            help="Scans per second and latency of detector.stream(scans) beside single calls.",
+            rich_help_panel="Measurements",
+        ),
     ] = False,
     cold: Annotated[
         bool,
-        typer.Option("--cold", help="New processes: seconds to the first boxes, and the peak memory of asca detect."),
+        typer.Option(
+            "--cold",
+            help="New processes: seconds to the first boxes, and the peak memory of asca detect.",
+            rich_help_panel="Measurements",
+        ),
     ] = False,
     deadline: Annotated[
         float | None,
@@ -66,6 +95,7 @@ def bench(
             min=0.001,
             help="Milliseconds, such as 100: print the share of scans that take longer.",
             rich_help_panel="Output",
+            metavar="MS",
         ),
     ] = None,
     late_share: Annotated[
@@ -76,18 +106,13 @@ def bench(
             max=1,
             help="With --deadline: exit with code 1 if a larger share takes longer.",
             rich_help_panel="Output",
+            metavar="SHARE",
         ),
     ] = 1.0,
-    around: AroundOption = False,
-    sensor_height: SensorHeightOption = None,
-    axes: AxesOption = "x-forward",
-    pose: PoseOption = None,
-    reflectance_scale: ReflectanceScaleOption = "auto",
-    columns: ColumnsOption = None,
-    topic: Annotated[
-        str | None, typer.Option("--topic", help="Of a recording: the topic of its scans. Default: the only one.")
-    ] = None,
     json: JsonOption = None,
+    provider: ProviderOption = "cpu",
+    precision: PrecisionOption = None,
+    threads: ThreadsOption = None,
 ) -> None:
     """Time every stage from points to boxes: p50, p95, p99, FPS, cold start, memory, and the machine it ran on.
 

@@ -18,10 +18,11 @@ from asca_pillars.cli.options import (
     PrecisionOption,
     ProviderOption,
     ReflectanceScaleOption,
-    ScansArgument,
+    ScansOrRecordingArgument,
     ScoreOption,
     SensorHeightOption,
     ThreadsOption,
+    TopicOption,
     VideoOption,
     VideoViewOption,
     read_scores,
@@ -41,38 +42,16 @@ TIMED_FRAMES = 6  # at least so many are run, the first is left out: one frame a
 
 
 def detect(
-    scans: ScansArgument = None,
+    scans: ScansOrRecordingArgument = None,
     *,
     bundle: BundleOption = None,
-    out: Annotated[
-        Path, typer.Option("--out", "-o", help="Folder for pictures and boxes.", rich_help_panel="Output")
-    ] = Path("detections"),
-    score: ScoreOption = None,
-    pictures: Annotated[
-        bool | None,
-        typer.Option(
-            "--pictures/--no-pictures",
-            help="Draw a bird's-eye picture of each scan; without, faster. Default: drawn, but not with --cluster.",
-            rich_help_panel="Output",
-        ),
-    ] = None,
-    provider: ProviderOption = "cpu",
-    precision: PrecisionOption = None,
-    threads: ThreadsOption = None,
     around: AroundOption = False,
     sensor_height: SensorHeightOption = None,
     axes: AxesOption = "x-forward",
     pose: PoseOption = None,
     reflectance_scale: ReflectanceScaleOption = "auto",
     columns: ColumnsOption = None,
-    topic: Annotated[
-        str | None,
-        typer.Option(
-            "--topic",
-            help="Of a recording: the topic of its scans. Default: the only one.",
-            rich_help_panel="Recording",
-        ),
-    ] = None,
+    topic: TopicOption = None,
     frame: Annotated[
         str | None,
         typer.Option(
@@ -132,8 +111,14 @@ def detect(
             rich_help_panel="Recording",
         ),
     ] = None,
-    video: VideoOption = None,
-    video_view: VideoViewOption = "above",
+    image_topic: Annotated[
+        str | None,
+        typer.Option(
+            "--image-topic",
+            help="Of a recording, with --rerun: the topic of the camera images. Default: the first one.",
+            rich_help_panel="Recording",
+        ),
+    ] = None,
     calib: Annotated[
         Path | None,
         typer.Option(
@@ -142,6 +127,20 @@ def detect(
             rich_help_panel="Recording",
         ),
     ] = None,
+    out: Annotated[
+        Path, typer.Option("--out", "-o", help="Folder for pictures and boxes.", rich_help_panel="Output")
+    ] = Path("detections"),
+    score: ScoreOption = None,
+    pictures: Annotated[
+        bool | None,
+        typer.Option(
+            "--pictures/--no-pictures",
+            help="Draw a bird's-eye picture of each scan; without, faster. Default: drawn, but not with --cluster.",
+            rich_help_panel="Output",
+        ),
+    ] = None,
+    video: VideoOption = None,
+    video_view: VideoViewOption = "above",
     write: Annotated[
         str | None,
         typer.Option(
@@ -151,6 +150,9 @@ def detect(
             rich_help_panel="Output",
         ),
     ] = None,
+    provider: ProviderOption = "cpu",
+    precision: PrecisionOption = None,
+    threads: ThreadsOption = None,
     cluster: ClusterOption = None,
 ) -> None:
     """Find cars, pedestrians and cyclists; write the boxes and a bird's-eye picture of each scan.
@@ -228,6 +230,7 @@ def detect(
                 calib=calib,
                 foxglove=foxglove,
                 rerun=rerun,
+                image_topic=image_topic,
                 video=video,
                 video_view=view,
                 options=options,
@@ -239,8 +242,9 @@ def detect(
             )
         _print_recording(recorded, console)
         return
-    if topic or frame or odometry or calib:
-        raise ConfigError("--topic, --frame, --odometry and --calib need a recording (.mcap, .db3, .bag, .pcap)")
+    if topic or frame or odometry or calib or image_topic:
+        options_of = "--topic, --frame, --odometry, --image-topic and --calib"
+        raise ConfigError(f"{options_of} need a recording (.mcap, .db3, .bag, .pcap)")
     if cluster is not None:
         from asca_deploy.detect_archive import detect_archive
         from asca_pillars.scans.find_scans import name_scans

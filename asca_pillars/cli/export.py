@@ -23,13 +23,30 @@ def export(
         ),
     ],
     *,
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder to be written.")],
     scans: Annotated[
         Path | None,
         typer.Option(
             "--scans",
             help="Scans like those trained on, to compare on. Default: 8 simulated ones. With --golden or --browser "
             "the one that is run. Default: the sample that comes with asca.",
+            rich_help_panel="Input",
+        ),
+    ] = None,
+    calibrate: Annotated[
+        Path | None,
+        typer.Option(
+            "--calibrate",
+            help="Scans like those trained on, to calibrate with; 96 of the folder, evenly spaced. Default: simulated.",
+            rich_help_panel="Input",
+        ),
+    ] = None,
+    ort_web: Annotated[
+        Path | None,
+        typer.Option(
+            "--ort-web",
+            help="For --browser: npm's package onnxruntime-web, a .tgz or its folder. Default: what `npm pack` or `npm "
+            "install` left in this folder.",
+            rich_help_panel="Input",
         ),
     ] = None,
     trained_on: Annotated[
@@ -37,9 +54,9 @@ def export(
         typer.Option(
             "--trained-on",
             help="What the weights saw, for the manifest. Default: what a bundle says of itself, or `not stated`.",
+            rich_help_panel="Bundle",
         ),
     ] = None,
-    score: ScoreOption = None,
     range_m: Annotated[
         tuple[float, float, float, float] | None,
         typer.Option(
@@ -47,44 +64,50 @@ def export(
             metavar="X0 X1 Y0 Y1",
             help="Where the bundle looks for objects, in metres; the weights are the same for every range. Default: "
             "the checkpoint's. Ahead alone: 0 69.12 -30.72 30.72",
+            rich_help_panel="Bundle",
         ),
     ] = None,
     int8: Annotated[
-        bool, typer.Option("--int8", help="8-bit backbone: several times faster on a CPU, a quarter of the size.")
-    ] = False,
-    calibrate: Annotated[
-        Path | None,
+        bool,
         typer.Option(
-            "--calibrate",
-            help="Scans like those trained on, to calibrate with; 96 of the folder, evenly spaced. Default: simulated.",
+            "--int8",
+            help="8-bit backbone: several times faster on a CPU, a quarter of the size.",
+            rich_help_panel="Bundle",
         ),
-    ] = None,
+    ] = False,
     dense_neck: Annotated[
         bool,
         typer.Option(
             "--dense-neck",
             help="Write a sparse neck as dense convolutions with masks: the same boxes, for OpenVINO and TensorRT, "
             "which want fixed shapes, and for GPUs. Slower on a CPU.",
+            rich_help_panel="Bundle",
         ),
     ] = False,
     with_weights: Annotated[
-        bool, typer.Option("--with-weights", help="Add the weights, in 16 bits, for `asca train --init`.")
+        bool,
+        typer.Option(
+            "--with-weights", help="Add the weights, in 16 bits, for `asca train --init`.", rich_help_panel="Bundle"
+        ),
     ] = False,
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder to be written.", rich_help_panel="Output")],
+    score: ScoreOption = None,
     golden: Annotated[
-        bool, typer.Option("--golden", help="Write every stage's arrays for one scan, to check other runtimes by.")
+        bool,
+        typer.Option(
+            "--golden",
+            help="Write every stage's arrays for one scan, to check other runtimes by.",
+            rich_help_panel="Output",
+        ),
     ] = False,
     browser: Annotated[
         bool,
-        typer.Option("--browser", help="Write a static web page that runs the bundle in the browser, zipped too."),
-    ] = False,
-    ort_web: Annotated[
-        Path | None,
         typer.Option(
-            "--ort-web",
-            help="For --browser: npm's package onnxruntime-web, a .tgz or its folder. Default: what `npm pack` or `npm "
-            "install` left in this folder.",
+            "--browser",
+            help="Write a static web page that runs the bundle in the browser, zipped too.",
+            rich_help_panel="Output",
         ),
-    ] = None,
+    ] = False,
 ) -> None:
     """Export to ONNX and compare with PyTorch on scans, head maps and boxes; fails if they differ.
 

@@ -26,22 +26,36 @@ def import_dataset(
             "--from",
             metavar="FORMAT",
             help=" ".join(f"{name}: {form.help}." for name, form in FORMATS.items()),
+            rich_help_panel="Input",
         ),
     ] = "boxes",
     scans: Annotated[
-        Path | None, typer.Option("--scans", help="Folder of the scans; with boxes and labels of tools.")
-    ] = None,
-    rename: Annotated[
-        list[str] | None,
-        typer.Option("--rename", help="OLD=NEW, a class by another name; several may get one name. Repeatable."),
+        Path | None,
+        typer.Option("--scans", help="Folder of the scans; with boxes and labels of tools.", rich_help_panel="Input"),
     ] = None,
     sensor_height: SensorHeightOption = None,
     axes: AxesOption = "x-forward",
     pose: PoseOption = None,
     reflectance_scale: ReflectanceScaleOption = "auto",
     columns: ColumnsOption = None,
+    rename: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--rename",
+            help="OLD=NEW, a class by another name; several may get one name. Repeatable.",
+            rich_help_panel="Output",
+        ),
+    ] = None,
     val_share: Annotated[
-        float, typer.Option("--val-share", min=0.01, max=0.9, help="Share of the recordings in ImageSets/val.txt.")
+        float,
+        typer.Option(
+            "--val-share",
+            min=0.01,
+            max=0.9,
+            help="Share of the recordings in ImageSets/val.txt.",
+            metavar="SHARE",
+            rich_help_panel="Output",
+        ),
     ] = 0.2,
 ) -> None:
     """Make a dataset of scans with boxes that train, inspect, prepare and eval read; no camera is needed.

@@ -14,7 +14,6 @@ def import_weights(
         Path, typer.Argument(help="Checkpoint of OpenPCDet's or mmdetection3d's PointPillars or PV-RCNN (.pth).")
     ],
     *,
-    out: Annotated[Path, typer.Option("--out", "-o", help="Checkpoint to write, such as pointpillars.ckpt.")],
     config: Annotated[
         Path | None,
         typer.Option(
@@ -23,9 +22,14 @@ def import_weights(
             help="YAML of the model, or the name of one that ships. Default: the published model on KITTI "
             "(openpcdet_pointpillars_kitti, pv_rcnn_kitti, mmdetection3d_pointpillars_kitti, "
             "mmdetection3d_pv_rcnn_kitti). Other ranges, classes or widths need their own.",
+            rich_help_panel="Input",
         ),
     ] = None,
     override: OverridesOption = None,
+    out: Annotated[
+        Path,
+        typer.Option("--out", "-o", help="Checkpoint to write, such as pointpillars.ckpt.", rich_help_panel="Output"),
+    ],
 ) -> None:
     """Import weights of OpenPCDet or mmdetection3d 1.x.
 

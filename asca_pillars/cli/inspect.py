@@ -1,31 +1,72 @@
-"""`asca inspect`: what a dataset holds and whether a configuration fits it, before hours of training."""
+"""`asca inspect`: a dataset before hours of training, or scans without labels before they are detected."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from asca_pillars.base.extras import require
-from asca_pillars.cli.options import JsonOption
+from asca_pillars.cli.options import (
+    AroundOption,
+    AxesOption,
+    BundleOption,
+    ColumnsOption,
+    JsonOption,
+    PoseOption,
+    ReflectanceScaleOption,
+    SensorHeightOption,
+    TopicOption,
+    scan_settings,
+)
 
 
 def inspect(
     data: Annotated[
-        Path, typer.Argument(help="Folder of a dataset: KITTI's layout, or with a dataset.yaml (docs/DATA.md).")
+        Path,
+        typer.Argument(
+            help="Folder of a dataset: KITTI's layout, or with a dataset.yaml (docs/DATA.md); or without labels a "
+            "recording (.mcap .db3 .bag .pcap, a rosbag2 folder), a scan or a folder of scans."
+        ),
     ],
     *,
-    config: Annotated[Path, typer.Option("--config", "-c", help="YAML to train with, or the name of one that ships.")],
+    config: Annotated[
+        Path | None,
+        typer.Option(
+            "--config",
+            "-c",
+            help="Of a dataset: the YAML to train with, or the name of one that ships.",
+            rich_help_panel="Input",
+        ),
+    ] = None,
     split: Annotated[
         str | None,
-        typer.Option("--split", help="A list in ImageSets/, or training for every scan. Default: data.train_set."),
+        typer.Option(
+            "--split",
+            help="A list in ImageSets/, or training for every scan. Default: data.train_set.",
+            rich_help_panel="Input",
+        ),
     ] = None,
-    frames: Annotated[int, typer.Option("--frames", "-n", min=1, help="Look at so many frames, evenly spaced.")] = 500,
+    frames: Annotated[
+        int,
+        typer.Option(
+            "--frames", "-n", min=1, help="Look at so many frames, evenly spaced.", rich_help_panel="Input", metavar="N"
+        ),
+    ] = 500,
+    bundle: BundleOption = None,
+    around: AroundOption = False,
+    sensor_height: SensorHeightOption = None,
+    axes: AxesOption = "x-forward",
+    pose: PoseOption = None,
+    reflectance_scale: ReflectanceScaleOption = "auto",
+    columns: ColumnsOption = None,
+    topic: TopicOption = None,
     propose: Annotated[
         Path | None,
         typer.Option(
             "--propose",
             help="Measure classes, anchors, thresholds and ranges on the labels, and write the config with them to "
             "this YAML; what is inspected is then how well it fits.",
+            rich_help_panel="Output",
         ),
     ] = None,
     draw: Annotated[
@@ -35,10 +76,15 @@ def inspect(
             min=1,
             help="Also draw so many training frames from above, with their labels, as training sees them: objects "
             "inserted, augmented.",
+            rich_help_panel="Output",
+            metavar="N",
         ),
     ] = None,
     out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="Folder for the pictures of --draw. Default: inspection.")
+        Path | None,
+        typer.Option(
+            "--out", "-o", help="Folder for the pictures of --draw. Default: inspection.", rich_help_panel="Output"
+        ),
     ] = None,
     json: JsonOption = None,
 ) -> None:
@@ -46,12 +92,97 @@ def inspect(
 
     Warnings name their remedy. A class that would have no positive anchor at all is an error: exit code 4.
 
+    Scans without labels, files or a recording, are compared with those that a model (--bundle) was trained on: rate,
+    gaps, points, reflectance, height of the sensor, share of the points within its ranges. The options of Sensor and
+    Recording are for them, as for asca detect; a dataset states how its scans lie.
+
     Examples:
 
     asca inspect data/kitti -c asca_pointpillars_kitti --draw 8
 
     asca inspect data/own -c asca_small_sim --propose own.yaml
+
+    asca inspect drive.mcap --axes y-forward --around
     """
+    from asca_pillars.base.errors import ConfigError
+    from asca_pillars.scans.recordings.open_recording import is_recording
+
+    of_scans = {
+        "--bundle": bundle,
+        "--around": around or None,
+        "--sensor-height": sensor_height,
+        "--axes": None if axes == "x-forward" else axes,
+        "--pose": pose,
+        "--reflectance-scale": None if reflectance_scale == "auto" else reflectance_scale,
+        "--columns": columns,
+        "--topic": topic,
+    }
+    of_labels = {"--split": split, "--propose": propose, "--draw": draw, "--out": out}
+    if config is not None:
+        if is_recording(data):
+            raise ConfigError(f"{data}: is a recording, and --config {config} for datasets with labels; leave it out")
+        for name, value in of_scans.items():
+            if value is not None:
+                raise ConfigError(f"{name}: is for scans without labels, and --config for datasets; leave one out")
+        _inspect_dataset(data, config, split=split, frames=frames, propose=propose, draw=draw, out=out, json=json)
+        return
+    for name, value in of_labels.items():
+        if value is not None:
+            raise ConfigError(f"{name} {value}: is for a dataset with labels; give --config, too")
+    reading = scan_settings(
+        sensor_height=sensor_height, axes=axes, pose=pose, reflectance_scale=reflectance_scale, columns=columns
+    )
+    _inspect_scans(data, json, topic=topic, bundle=bundle, around=around, reading=reading, frames=frames)
+
+
+def _inspect_scans(data: Path, json: Path | None, **options: Any) -> None:
+    """Print what `inspect_scans` finds; PartialError if some scans cannot be read."""
+    from dataclasses import asdict
+
+    from rich.console import Console
+
+    from asca_deploy.inspect_scans import inspect_scans
+    from asca_pillars.base.errors import ConfigError, PartialError, printable
+    from asca_pillars.base.files import write_json
+    from asca_pillars.base.own_files import json_object, require_own_file
+    from asca_pillars.base.writable_file import require_writable
+    from asca_pillars.cli import inspect_tables as show
+    from asca_pillars.cli.progress import Bars
+    from asca_pillars.data.boxes.box_split import DATASET_FILE
+
+    if (data / DATASET_FILE).is_file() or (data / "training").is_dir():
+        raise ConfigError(f"{data}: is a dataset; give --config, or to look at its scans alone their folder")
+    report_json = "asca inspect --json", json_object("model", "frame_ids", "inside_share", "findings")
+    require_writable(json, *report_json, inputs=(data,))
+    console = Console(markup=False, highlight=False)
+    with Bars(console, transient=True) as bars:
+        found = inspect_scans(data, **options, progress=bars)
+    if json is not None:
+        require_own_file(json, *report_json)
+        height = None if found.height is None else found.height._asdict()
+        write_json(json, asdict(found) | {"topics": [topic._asdict() for topic in found.topics], "height": height})
+    for part in (*show.recorded(found), show.unlabelled(found)):
+        console.print(part, soft_wrap=isinstance(part, str))
+    for text in found.findings:
+        console.print(f"warning: {printable(text)}", style="yellow", soft_wrap=True)
+    if found.problems:
+        raise PartialError("; ".join(found.problems))
+    if not found.findings:
+        console.print("Nothing to warn of.")
+
+
+def _inspect_dataset(
+    data: Path,
+    config: Path,
+    *,
+    split: str | None,
+    frames: int,
+    propose: Path | None,
+    draw: int | None,
+    out: Path | None,
+    json: Path | None,
+) -> None:
+    """Print the tables and findings of a dataset; DatasetError if training could learn nothing of it."""
     import dataclasses
 
     from rich.console import Console

@@ -4,6 +4,8 @@ from collections.abc import Sequence
 
 from rich.table import Table
 
+from asca_deploy.inspect_scans import ScansInspection
+from asca_pillars.base.errors import printable
 from asca_pillars.data.frames import NEIGHBOR_TYPES
 from asca_pillars.data.inspection.inspect_dataset import ClassFacts, Inspection, Spread
 from asca_pillars.data.inspection.measurements import InputCells
@@ -98,11 +100,56 @@ def scans(inspection: Inspection, kind: InputCells, camera_view: bool) -> Table:
     return table
 
 
+def recorded(found: ScansInspection) -> list[Table | str]:
+    """What was inspected; of a recording its topics, if there are several, and its times, frames and fields."""
+    of_topic = "" if found.topic is None else f", {printable(found.topic)}"
+    looks_in = ", ".join(f"{axis} {low:g} to {high:g}" for axis, (low, high) in zip("xyz", found.ranges, strict=True))
+    lines: list[Table | str] = [
+        f"{found.path}{of_topic}: {found.inspected} of {found.scans} scans measured",
+        f"against {found.model}, which looks in {looks_in} m",
+        *map(printable, found.notes),
+    ]
+    if len(found.topics) > 1:
+        topics = _table("Topics", "topic", "type", "messages")
+        for topic in found.topics:
+            topics.add_row(printable(topic.name), printable(topic.type), str(topic.messages))
+        lines.append(topics)
+    facts = []
+    if found.times is not None:
+        rate = "" if found.times.rate_hz is None else f", {found.times.rate_hz:.3g} scans per second"
+        facts.append(f"{found.times.seconds:.1f} s{rate}")
+    if found.frame_ids:
+        facts.append(f"frame {', '.join(found.frame_ids)}")
+    if found.fields:
+        facts.append(f"fields {', '.join(found.fields)}")
+    return [*lines, *([printable("; ".join(facts))] if facts else [])]
+
+
+def unlabelled(found: ScansInspection) -> Table:
+    """Points, reflectance, ground and ranges of scans without labels, against those of a model's training."""
+    expected, height = found.expected, found.height
+    low, high = expected.points_per_scan
+    view = " (a camera's view)" if expected.camera_view else ""
+    dark, bright = expected.reflectance_mean
+    ground = "-" if expected.ground_z_m is None else f"{expected.ground_z_m[0]:.2f} to {expected.ground_z_m[1]:.2f}"
+    trained_m = "-" if expected.sensor_height_m is None else f"{expected.sensor_height_m:.2f}"
+    share = None if found.inside_share is None else Spread(*(100 * value for value in found.inside_share))
+    table = _table("Scans: 10 % / median / 90 %", "", "found", "expected")
+    table.add_row("points", _spread(found.points), f"{low} to {high}{view}")
+    table.add_row("points not finite", str(found.not_finite), "0")
+    table.add_row("points within the ranges, %", _spread(share, 1), "")
+    table.add_row("reflectance as stored", ", ".join(f"0 to {one:g}" for one in found.reflectance_scales) or "none", "")
+    table.add_row("mean reflectance as read", _spread(found.reflectance, 3), f"{dark:.3f} to {bright:.3f}")
+    table.add_row("ground near the sensor, z, m", _spread(found.ground_z_m, 2), ground)
+    table.add_row("sensor above the ground, m", "-" if height is None else f"{height.height_m:.2f}", trained_m)
+    return table
+
+
 def _table(title: str, first: str, *others: str) -> Table:
     table = Table(title=title, title_justify="left")
     table.add_column(first, no_wrap=True)
     for name in others:
-        table.add_column(name, justify="left" if name in ("in training", "expected") else "right")
+        table.add_column(name, justify="left" if name in ("in training", "expected", "type") else "right")
     return table
 
 

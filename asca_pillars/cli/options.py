@@ -11,11 +11,15 @@ from asca_pillars.base.errors import ConfigError
 if TYPE_CHECKING:
     from asca_pillars.scans.scan_settings import ScanSettings
 
+_SCANS = "Scans (.bin .npy .pcd .ply .feather) and folders of them, searched to any depth"
 ScansArgument = Annotated[
+    list[Path] | None, typer.Argument(help=f"{_SCANS}. Default: the sample that comes with asca.")
+]
+ScansOrRecordingArgument = Annotated[
     list[Path] | None,
     typer.Argument(
-        help="Scans (.bin .npy .pcd .ply .feather) and folders of them, searched to any depth. Default: the sample "
-        "that comes with asca."
+        help=f"{_SCANS}; or one recording (.mcap .db3 .bag .pcap, a rosbag2 folder). Default: the sample that comes "
+        "with asca.",
     ),
 ]
 BundleOption = Annotated[
@@ -74,7 +78,12 @@ ConfigArgument = Annotated[
 ]
 OverridesOption = Annotated[
     list[str] | None,
-    typer.Option("--set", "-s", help="key.subkey=value, wins over the YAML. Repeatable: -s train.epochs=20"),
+    typer.Option(
+        "--set",
+        "-s",
+        help="key.subkey=value, wins over the YAML. Repeatable: -s train.epochs=20",
+        rich_help_panel="Input",
+    ),
 ]
 InitOption = Annotated[
     Path | None,
@@ -82,6 +91,7 @@ InitOption = Annotated[
         "--init",
         help="Weights that a new run starts from: a checkpoint, or a bundle that holds its own (folder, or name of one "
         "that ships). Where model.train_first_stage is false, its first stage alone is taken.",
+        rich_help_panel="Input",
     ),
 ]
 JsonOption = Annotated[
@@ -130,6 +140,14 @@ ColumnsOption = Annotated[
         "--columns",
         help="Values of a point in a .bin file. Default: 4, or 5 where the fifth counts rings.",
         rich_help_panel="Sensor",
+    ),
+]
+TopicOption = Annotated[
+    str | None,
+    typer.Option(
+        "--topic",
+        help="Of a recording: the topic of its scans. Default: the only one.",
+        rich_help_panel="Recording",
     ),
 ]
 AroundOption = Annotated[

@@ -13,15 +13,18 @@ def prepare(
     *,
     data: DataOption,
     override: OverridesOption = None,
-    workers: Annotated[int, typer.Option("--workers", "-w", min=1, help="Processes.")] = 2,
     kitti_split: Annotated[
         bool,
         typer.Option(
             "--kitti-split",
             help="Before that, write ImageSets/train.txt and val.txt with the 3,712 and 3,769 frames that papers train "
             "and validate on (Chen et al., 2015), for KITTI's 7,481 scans.",
+            rich_help_panel="Output",
         ),
     ] = False,
+    workers: Annotated[
+        int, typer.Option("--workers", "-w", min=1, help="Processes.", metavar="N", rich_help_panel="Speed")
+    ] = 2,
 ) -> None:
     """Compute once what training needs of a dataset.
 

@@ -36,9 +36,7 @@ def ros2(
             rich_help_panel="Input",
         ),
     ] = "auto",
-    track: Annotated[
-        bool, typer.Option("--track", help="Give boxes identities and velocities over time.", rich_help_panel="Output")
-    ] = False,
+    bundle: BundleOption = None,
     frame: Annotated[
         str | None,
         typer.Option(
@@ -48,20 +46,22 @@ def ros2(
             rich_help_panel="Sensor",
         ),
     ] = None,
-    bundle: BundleOption = None,
-    score: ScoreOption = None,
-    provider: ProviderOption = "cpu",
-    precision: PrecisionOption = None,
-    threads: ThreadsOption = None,
     around: AroundOption = False,
     sensor_height: SensorHeightOption = None,
     axes: AxesOption = "x-forward",
     pose: PoseOption = None,
     reflectance_scale: ReflectanceScaleOption = "auto",
+    track: Annotated[
+        bool, typer.Option("--track", help="Give boxes identities and velocities over time.", rich_help_panel="Output")
+    ] = False,
+    score: ScoreOption = None,
     log_every: Annotated[
         int,
         typer.Option("--log-every", help="Scans between two lines of figures in the log.", rich_help_panel="Output"),
     ] = 100,
+    provider: ProviderOption = "cpu",
+    precision: PrecisionOption = None,
+    threads: ThreadsOption = None,
 ) -> None:
     """Answer every scan of a ROS 2 topic with boxes, until SIGINT or SIGTERM.
 

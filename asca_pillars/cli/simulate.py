@@ -17,64 +17,22 @@ FRAMES, LENGTH = 100, 100
 def simulate(
     out: Annotated[Path, typer.Argument(help="Folder for the KITTI-layout dataset.")],
     *,
-    frames: Annotated[
-        int | None,
-        typer.Option(
-            "--frames",
-            "-n",
-            min=1,
-            help=f"Frames to write. Default: {FRAMES}; with --report none where there are scans already.",
-        ),
-    ] = None,
-    sequences: Annotated[
-        int | None,
-        typer.Option(
-            "--sequences",
-            min=1,
-            help="Short drives at 10 Hz instead of single scans: the car and the road users move, boxes carry "
-            "identities and velocities. Written as a dataset of boxes without a camera (docs/RECORDINGS.md).",
-        ),
-    ] = None,
-    length: Annotated[
-        int | None,
-        typer.Option("--length", min=1, help=f"With --sequences: scans of each; 10 make a second. Default: {LENGTH}."),
-    ] = None,
-    seed: Annotated[
-        int, typer.Option("--seed", min=0, help="Same seed, same bytes, whatever the number of workers.")
-    ] = 0,
-    workers: Annotated[int, typer.Option("--workers", "-w", min=1, help="Processes, without --cluster.")] = 2,
-    cluster: ClusterOption = None,
     config: Annotated[
         str | None,
         typer.Option(
-            "--config", "-c", help="YAML of scenes and sensor, or the name of one that ships. Default: KITTI's."
+            "--config",
+            "-c",
+            help="YAML of scenes and sensor, or the name of one that ships. Default: KITTI's.",
+            rich_help_panel="Input",
         ),
     ] = None,
-    view: Annotated[
-        str | None,
-        typer.Option(
-            "--view",
-            help="full: 360 degrees, of which the camera's part is labelled, as in KITTI; around: 360 degrees, all "
-            "of it labelled; camera: only what the camera sees, 6x smaller. Default: the config's; else full.",
-        ),
-    ] = None,
-    val_share: Annotated[
-        float, typer.Option("--val-share", min=0, max=1, help="Share of the frames listed in ImageSets/val.txt.")
-    ] = 0.1,
-    report: Annotated[
-        bool,
-        typer.Option(
-            "--report",
-            help="Compare the frames with KITTI's statistics: tables and plots in OUT/report/. "
-            "Needs matplotlib, the extra eval: `asca doctor` says how to install it.",
-        ),
-    ] = False,
     like: Annotated[
         Path | None,
         typer.Option(
             "--like",
             help="Labelled real frames in KITTI's layout: compare each object in them with simulated ones at like "
             "distance, angle of view and occlusion; table, JSON and picture in OUT/report/. Needs matplotlib, too.",
+            rich_help_panel="Input",
         ),
     ] = None,
     bundle: Annotated[
@@ -84,8 +42,87 @@ def simulate(
             "-b",
             help="With --like: also compare the scores that this bundle (or checkpoint) gives to real objects and "
             "their look-alikes, and how often it fires at what has no label.",
+            rich_help_panel="Input",
         ),
     ] = None,
+    frames: Annotated[
+        int | None,
+        typer.Option(
+            "--frames",
+            "-n",
+            min=1,
+            help=f"Frames to write. Default: {FRAMES}; with --report none where there are scans already.",
+            metavar="N",
+            rich_help_panel="Scenes",
+        ),
+    ] = None,
+    sequences: Annotated[
+        int | None,
+        typer.Option(
+            "--sequences",
+            min=1,
+            help="Short drives at 10 Hz instead of single scans: the car and the road users move, boxes carry "
+            "identities and velocities. Written as a dataset of boxes without a camera (docs/RECORDINGS.md).",
+            metavar="N",
+            rich_help_panel="Scenes",
+        ),
+    ] = None,
+    length: Annotated[
+        int | None,
+        typer.Option(
+            "--length",
+            min=1,
+            help=f"With --sequences: scans of each; 10 make a second. Default: {LENGTH}.",
+            metavar="N",
+            rich_help_panel="Scenes",
+        ),
+    ] = None,
+    seed: Annotated[
+        int,
+        typer.Option(
+            "--seed",
+            min=0,
+            help="Same seed, same bytes, whatever the number of workers.",
+            metavar="N",
+            rich_help_panel="Scenes",
+        ),
+    ] = 0,
+    view: Annotated[
+        str | None,
+        typer.Option(
+            "--view",
+            help="full: 360 degrees, of which the camera's part is labelled, as in KITTI; around: 360 degrees, all "
+            "of it labelled; camera: only what the camera sees, 6x smaller. Default: the config's; else full.",
+            rich_help_panel="Scenes",
+        ),
+    ] = None,
+    val_share: Annotated[
+        float,
+        typer.Option(
+            "--val-share",
+            min=0,
+            max=1,
+            help="Share of the frames listed in ImageSets/val.txt.",
+            metavar="SHARE",
+            rich_help_panel="Output",
+        ),
+    ] = 0.1,
+    report: Annotated[
+        bool,
+        typer.Option(
+            "--report",
+            help="Compare the frames with KITTI's statistics: tables and plots in OUT/report/. "
+            "Needs matplotlib, the extra eval: `asca doctor` says how to install it.",
+            rich_help_panel="Output",
+        ),
+    ] = False,
+    workers: Annotated[
+        int,
+        typer.Option(
+            "--workers", "-w", min=1, help="Processes, without --cluster.", metavar="N", rich_help_panel="Speed"
+        ),
+    ] = 2,
+    cluster: ClusterOption = None,
 ) -> None:
     """Write simulated street scans with labels in KITTI's layout, and say how like real ones they are.
 

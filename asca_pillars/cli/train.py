@@ -15,13 +15,27 @@ def train(
     config: ConfigArgument,
     *,
     data: DataOption,
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder of the run; an interrupted run there is resumed.")],
     override: OverridesOption = None,
-    devices: Annotated[str, typer.Option("--devices", help="Devices on this machine: a number or auto.")] = "auto",
-    num_nodes: Annotated[
-        int, typer.Option("--num-nodes", min=1, help="Machines that train together (torchrun or SLURM starts each).")
-    ] = 1,
     init: InitOption = None,
+    out: Annotated[
+        Path,
+        typer.Option(
+            "--out", "-o", help="Folder of the run; an interrupted run there is resumed.", rich_help_panel="Output"
+        ),
+    ],
+    devices: Annotated[
+        str, typer.Option("--devices", help="Devices on this machine: a number or auto.", rich_help_panel="Speed")
+    ] = "auto",
+    num_nodes: Annotated[
+        int,
+        typer.Option(
+            "--num-nodes",
+            min=1,
+            help="Machines that train together (torchrun or SLURM starts each).",
+            metavar="N",
+            rich_help_panel="Speed",
+        ),
+    ] = 1,
 ) -> None:
     """Train a detector; checkpoints, TensorBoard logs and the resolved config go to the run's folder.
 

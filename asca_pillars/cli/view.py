@@ -26,6 +26,12 @@ def view(
     scans: ScansArgument = None,
     *,
     bundle: BundleOption = None,
+    around: AroundOption = False,
+    sensor_height: SensorHeightOption = None,
+    axes: AxesOption = "x-forward",
+    pose: PoseOption = None,
+    reflectance_scale: ReflectanceScaleOption = "auto",
+    columns: ColumnsOption = None,
     port: Annotated[
         int,
         typer.Option(
@@ -35,6 +41,7 @@ def view(
             help="Port of 127.0.0.1 to serve on. Default: a free one.",
             show_default=False,
             rich_help_panel="Output",
+            metavar="PORT",
         ),
     ] = 0,
     no_browser: Annotated[
@@ -44,12 +51,6 @@ def view(
     provider: ProviderOption = "cpu",
     precision: PrecisionOption = None,
     threads: ThreadsOption = None,
-    around: AroundOption = False,
-    sensor_height: SensorHeightOption = None,
-    axes: AxesOption = "x-forward",
-    pose: PoseOption = None,
-    reflectance_scale: ReflectanceScaleOption = "auto",
-    columns: ColumnsOption = None,
 ) -> None:
     """Show scans and the boxes found in them in 3D, in a browser on this computer, until Ctrl-C.
 

@@ -126,7 +126,7 @@ def draw_chase(
     for layer in reversed(layers):
         colors[points_in_boxes(points, np.asarray(layer.boxes).reshape(-1, 7), 0.05).any(axis=1)] = layer.color
     _draw_points(canvas, camera, places, colors)
-    _draw_ego(canvas, camera, ground_m)
+    _draw_ego(texts, camera, ground_m)
     for trail in trails:
         _draw_trail(canvas, camera, trail)
     _draw_boxes(texts, camera, layers)
@@ -187,10 +187,12 @@ def _draw_rings(canvas: Image, camera: ChaseCamera, ground_m: float, reach_m: fl
                 texts.put(f"{radius_m} m", [(pixel[0] + 8, pixel[1] - 6)], (170, 160, 150))
 
 
-def _draw_ego(canvas: Image, camera: ChaseCamera, ground_m: float) -> None:
+def _draw_ego(texts: Texts, camera: ChaseCamera, ground_m: float) -> None:
+    """The sensor as an arrow, which no text is to cover."""
     pixels, depth = camera.project(np.column_stack([_EGO_M, np.full(len(_EGO_M), ground_m + 0.05)]))
     if (depth > _NEAR_M).all():
-        cv2.fillPoly(canvas, [subpixels(pixels)], _WHITE, cv2.LINE_AA, SUBPIXEL_BITS)
+        cv2.fillPoly(texts.canvas, [subpixels(pixels)], _WHITE, cv2.LINE_AA, SUBPIXEL_BITS)
+        texts.reserve(*pixels.min(axis=0), *pixels.max(axis=0))
 
 
 def _draw_trail(canvas: Image, camera: ChaseCamera, trail: Trail) -> None:
@@ -224,7 +226,9 @@ def _draw_boxes(texts: Texts, camera: ChaseCamera, layers: Sequence[BoxLayer]) -
         if depth > _NEAR_M and 0 < column < camera.width_px and 0 < row < camera.height_px:
             width, height = texts.size(text)
             places = [(column - width / 2, row - lift) for lift in (2, 1.5 * height, 2.8 * height, 4.1 * height)]
-            texts.put(text, places, layer.color)
+            columns = camera.project(corners(box[None])[0])[0][:, 0]
+            beside = [(columns.max() + 8, row), (columns.min() - width - 8, row)]
+            texts.put(text, places + beside, layer.color)
 
 
 def _draw_box(canvas: Image, camera: ChaseCamera, box: NDArray[np.float64], layer: BoxLayer, depth_m: float) -> None:

@@ -136,8 +136,8 @@ def finite_scan(stored: StoredPoints, scale: ReflectanceScale) -> Scan:
         notes = ScanNotes(0, clipped, number, (*stored.remarks, *([doubt] if doubt else [])))
     finite, dropped = np.isfinite(points), 0
     if not finite.all():  # row by row is ten times slower
-        rows = finite.all(axis=1)
-        points, dropped = points[rows], int(len(rows) - rows.sum())
+        kept = points[finite.all(axis=1)]
+        points, dropped = kept, len(points) - len(kept)
     return Scan(points, replace(notes, dropped_points=dropped))
 
 

@@ -185,11 +185,15 @@ def detect_scans(
 
 
 def repairs(results: Iterable[DetectedScan]) -> Iterator[str]:
-    """Yield what was repaired, dropped or odd, each kind once, with the first such scan and a count."""
+    """Return what was repaired, dropped or odd, each kind once, with the first such scan and a count."""
+    return repairs_of((result.path.name, result.notes, result.detections.report.warnings) for result in results)
+
+
+def repairs_of(scans: Iterable[tuple[str, ScanNotes, Sequence[str]]]) -> Iterator[str]:
+    """Yield `repairs` from the name of each scan, the notes of its reading, and its warnings."""
     names: dict[str, list[str]] = defaultdict(list)
-    for result in results:
-        notes = result.notes
-        texts = [*notes.remarks, *result.detections.report.warnings]
+    for name, notes, warnings in scans:
+        texts = [*notes.remarks, *warnings]
         if notes.dropped_points:  # when the file was read; what the detector dropped is among its warnings
             texts.append(f"{notes.dropped_points} points are not finite and were dropped")
         if notes.clipped_reflectances:
@@ -198,6 +202,6 @@ def repairs(results: Iterable[DetectedScan]) -> Iterator[str]:
                 "to the nearer end; if they are stored on another scale, state it (--reflectance-scale)"
             )
         for text in texts:
-            names[_NUMBER.sub("#", text)].append(f"{result.path.name}: {text}")  # one kind: equal but for numbers
+            names[_NUMBER.sub("#", text)].append(f"{name}: {text}")  # one kind: equal but for numbers
     for lines in names.values():
         yield lines[0] + (f" (and {len(lines) - 1} more scans alike)" if lines[1:] else "")

@@ -179,7 +179,6 @@ class _Answers:
         answer = {
             "detections": _level_boxes(found),
             "timesMs": found.report.times_ms,
-            "counts": {name: content[name] for name in ("points", "points_outside")},
             "remarks": content["warnings"],
             "save": content,
         }

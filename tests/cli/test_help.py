@@ -5,13 +5,15 @@ from collections import defaultdict
 from pathlib import Path
 
 import click
+import pytest
 import yaml
 from typer.main import get_command
+from typer.testing import CliRunner
 
 from asca_pillars.cli.main import app
 
 PANELS = {
-    "Input": {"--bundle", "--data"},
+    "Input": {"--bundle", "--data", "--config", "--set", "--init", "--scans", "--split", "--compare"},
     "Sensor": {"--sensor-height", "--axes", "--pose", "--reflectance-scale", "--columns", "--around"},
     "Recording": {
         "--topic",
@@ -24,9 +26,11 @@ PANELS = {
         "--rerun",
         "--calib",
     },
-    "Output": {"--score", "--pictures", "--write"},
-    "Speed": {"--provider", "--precision", "--threads", "--cluster"},
+    "Output": {"--out", "--json", "--score", "--pictures", "--write", "--val-share"},
+    "Speed": {"--provider", "--precision", "--threads", "--cluster", "--workers"},
 }
+
+ORDER = ("Input", "Sensor", "Recording", "Scenes", "Measurements", "Metrics", "Bundle", "Output", "Speed")
 
 
 def commands() -> dict[str, click.Command]:
@@ -44,11 +48,36 @@ def test_short_names_mean_the_same_everywhere() -> None:
     assert meanings["-o"] == {"--out"}
 
 
-def test_options_of_detect_are_in_panels() -> None:
-    panels = {option.opts[0]: getattr(option, "rich_help_panel", None) for option in commands()["detect"].params}
-    for panel, names in PANELS.items():
-        assert {name for name in names if name in panels and panels[name] != panel} == set()
-    assert {name for name, panel in panels.items() if panel is None} <= {"scans", "--help"}
+def panels_of(command: click.Command) -> dict[str, str | None]:
+    """The panel of each option, in their order."""
+    options = [one for one in command.params if one.opts[0].startswith("--") and one.opts[0] != "--help"]
+    return {option.opts[0]: getattr(option, "rich_help_panel", None) for option in options}
+
+
+def test_options_are_in_panels() -> None:
+    """In all of a command's or in none, the input's first, and the same option in the same one everywhere."""
+    for name, command in commands().items():
+        panels = panels_of(command)
+        if not any(panels.values()):
+            assert len(panels) <= 3, name
+            continue
+        assert all(panels.values()), name
+        named = list(dict.fromkeys(panels.values()))
+        assert named[0] == "Input" and named == [panel for panel in ORDER if panel in named], name
+        for panel, names in PANELS.items():
+            if (name, panel) != ("ros2", "Recording"):  # it has no recording, but a live topic
+                assert {option for option in names & panels.keys() if panels[option] != panel} == set(), name
+
+
+@pytest.mark.parametrize("columns", [80, 100])
+def test_help_has_room_for_the_text(columns: int) -> None:
+    """A wide column of types leaves a ragged one of text."""
+    for name in commands():
+        text = CliRunner().invoke(app, [name, "--help"], env={"COLUMNS": str(columns), "NO_COLOR": "1"}).output
+        boxes = [line for line in text.splitlines() if line.startswith("│")]
+        assert all(len(line) <= columns for line in text.splitlines()), name
+        continued = [len(line[1:]) - len(line[1:].lstrip()) for line in boxes if line.startswith("│" + " " * 8)]
+        assert max(continued, default=0) < 50, name
 
 
 def test_paragraphs_are_one_line_each() -> None:

@@ -6,17 +6,29 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import cv2
+import numpy as np
 import pytest
 
 pytest.importorskip("rosbags", reason="needs pip install -e '.[recordings]'")
 
+from asca_deploy import sample_scan_path
 from asca_deploy.recordings import sequence_files
 from asca_deploy.recordings.journal import JOURNAL_FILE
 from asca_deploy.recordings.rerun_file import is_own_rrd
-from asca_pillars.base.errors import ConfigError, OutputError
+from asca_pillars.base.errors import ConfigError, OutputError, ScanError
+from asca_pillars.cli.detect import detect
 from asca_pillars.pictures.colors import class_rgb
 from tests.cli.short_drive import SCANS
 from tests.cli.test_detect_recording import run
+from tests.scans.recordings.cloud_recordings import (
+    clouds,
+    compressed_image,
+    image_message,
+    stamps,
+    store,
+    write_mcap,
+)
 
 
 def test_rerun_file_is_read_back(drive: Path, tmp_path: Path) -> None:
@@ -42,6 +54,65 @@ def test_rerun_file_is_read_back(drive: Path, tmp_path: Path) -> None:
     assert is_own_rrd(tmp_path / "out.rrd")
     assert boxes == {line["time_ns"]: [f"{box['class']} {box['track_id']}" for box in line["boxes"]] for line in lines}
     assert 1000 * SCANS < points <= 20_000 * SCANS
+
+
+def test_the_nearest_image_to_each_scan_is_shown(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A camera of half the lidar's rate that ends early, and another one."""
+    rerun = pytest.importorskip("rerun", reason="needs pip install -e '.[view]'")
+    times, pixels = stamps(12), np.arange(4 * 6 * 3, dtype=np.uint8).reshape(4, 6, 3)
+    stored: dict[int, bytes] = {}
+    for time_ns in (times[0] + 1, times[2] + 1):
+        _, picture = cv2.imencode(".jpg", pixels + len(stored))
+        stored[time_ns] = picture.tobytes()
+    one, kind = store(), "sensor_msgs/msg/Image"
+    raw = [(time_ns, bytes(one.serialize_cdr(image_message(time_ns, pixels, "bgr8"), kind))) for time_ns in times[:1]]
+    jpeg = [(time_ns, compressed_image(time_ns, content)) for time_ns, content in stored.items()]
+    images = {"/front": ("sensor_msgs/msg/CompressedImage", "cdr", jpeg), "/rear": (kind, "cdr", raw)}
+    path = write_mcap(tmp_path / "drive.mcap", {"/lidar": clouds(12, 2000)}, images=images)
+    run(path, tmp_path / "out", rerun=tmp_path / "out.rrd")
+    assert "images: of /front; --image-topic takes others of /front (" in " ".join(capsys.readouterr().out.split())
+    logged, views = read_camera(rerun, tmp_path / "out.rrd")
+    assert logged == [
+        (times[0], "file", stored[times[0] + 1]),
+        (times[2], "file", stored[times[2] + 1]),  # as near to the scan before
+        (times[8], "clear", None),
+    ]
+    assert {"3D", "2D"} == views
+    run(path, tmp_path / "out", rerun=tmp_path / "out.rrd", image_topic="/rear")
+    logged, _ = read_camera(rerun, tmp_path / "out.rrd")
+    assert logged[0] == (times[0], "pixels", pixels.tobytes()) and [kind for _, kind, _ in logged[1:]] == ["clear"]
+
+
+def test_without_images_there_is_no_view_of_them(drive: Path, tmp_path: Path) -> None:
+    rerun = pytest.importorskip("rerun", reason="needs pip install -e '.[view]'")
+    run(drive, tmp_path / "out", rerun=tmp_path / "out.rrd")
+    assert read_camera(rerun, tmp_path / "out.rrd") == ([], {"3D"})
+    with pytest.raises(ScanError, match="no images on a topic /camera; there are none"):
+        run(drive, tmp_path / "other", rerun=tmp_path / "out.rrd", image_topic="/camera")
+    with pytest.raises(ConfigError, match="--image-topic /camera: is shown in the file of --rerun"):
+        run(drive, tmp_path / "other", image_topic="/camera")
+    with pytest.raises(ConfigError, match="--image-topic and --calib need a recording"):
+        detect([sample_scan_path()], out=tmp_path / "other", image_topic="/camera")
+
+
+def read_camera(rerun: Any, path: Path) -> tuple[list[tuple[int, str, bytes | None]], set[str]]:
+    """Time, kind and bytes of what is logged of the camera, and the kinds of views."""
+    logged: list[tuple[int, str, bytes | None]] = []
+    reader = rerun.chunk.RrdReader(path)
+    fields = {"EncodedImage:blob": "file", "Image:buffer": "pixels", "Clear:is_recursive": "clear"}
+    for chunk in reader.stream():
+        batch = chunk.to_record_batch()
+        if chunk.entity_path != "/camera":
+            continue
+        field = next(name for name in batch.schema.names if name in fields)
+        for time_ns, (value,) in zip(batch["time"].cast("int64").to_pylist(), batch[field].to_pylist(), strict=True):
+            logged.append((time_ns, fields[field], bytes(value) if fields[field] != "clear" else None))
+    views = set()
+    for chunk in reader.stream(store=reader.blueprints()[0]):
+        batch = chunk.to_record_batch()
+        if "ViewBlueprint:class_identifier" in batch.schema.names:
+            views |= {kind for (kind,) in batch["ViewBlueprint:class_identifier"].to_pylist()}
+    return sorted(logged), views
 
 
 @pytest.mark.parametrize("content", [b"RRF2 of mine", b"asca-pillars"])

@@ -14,11 +14,18 @@ import pytest
 from numpy.typing import NDArray
 
 from asca_deploy import sample_scan_path, shipped_bundles
+from asca_deploy.around import about_ground, merge, turns_around, widened
+from asca_deploy.bundle import PillarBundle
 from asca_deploy.golden import write_golden
 from asca_deploy.manifest import load_pillar_bundle
-from asca_pillars.base.errors import ScanError
+from asca_pillars.base.errors import AscaError, ScanError
+from asca_pillars.detection.detections import Detections
+from asca_pillars.geometry.boxes import wrap_angle
 from asca_pillars.geometry.overlap import bev_iou
+from asca_pillars.geometry.ranges import Ranges
 from asca_pillars.pictures.colors import ground_height
+from asca_pillars.scans.ground_height import estimate_height, fit_ground_plane
+from asca_pillars.scans.mounting import Mounting
 from asca_pillars.scans.scan_reader import read_scan, write_scan
 from benchmarks.fuzz import damaged
 from benchmarks.fuzz_inputs import Kind, read_points, scan_seeds
@@ -107,8 +114,138 @@ def test_a_revolution_is_said_to_be_cut() -> None:
     cases = [(ranges, points), (ranges, ahead), (every_way, points), (ranges, points[:0])]
     found = call("grid.js", "unseenDirections", *([{"ranges": own}, scan.reshape(-1).tolist()] for own, scan in cases))
     cut, *fine = (answer["result"] for answer in found)
-    assert len(cut) == 1 and "asca detect --around" in cut[0]
+    assert len(cut) == 1 and "look all around" in cut[0]
     assert fine == [[], [], []]
+
+
+@pytest.mark.parametrize("axes", ["x-forward", "y-forward", "-y,x,z", " -x, -y,+z", "x,-y,-z", "x,-y,z"])
+def test_a_mounting_moves_points_and_boxes_as_python_does(axes: str) -> None:
+    level = Mounting(axes=axes).level
+    (answer,) = call("frames.js", "levelFrame", [axes])
+    change = {"axes": level.axes.tolist(), "shift": level.shift_m.tolist()}
+    assert np.array_equal(answer["result"]["axes"], level.axes) and answer["result"]["shift"] == [0, 0, 0]
+    points, boxes = tiny.make_scan(count=50), np.random.default_rng(1).uniform(-3, 3, (20, 7))
+    assert_moves_alike(change, level.points(points), level.boxes(boxes), points, boxes)
+
+
+def test_a_turn_about_a_sloping_ground_moves_points_and_boxes_as_python_does() -> None:
+    scan = read_scan(sample_scan_path()).points
+    ranges = Ranges((0.0, 69.12), (-30.72, 30.72), (-3.0, 1.0))
+    turns = about_ground(turns_around(ranges, camera_view=True), scan)
+    points, boxes = scan[:50], np.random.default_rng(1).uniform(-3, 3, (20, 7))
+    for turn in turns:
+        change = {"axes": turn.axes.tolist(), "shift": turn.shift_m.tolist()}
+        assert_moves_alike(change, turn.points(points), turn.boxes(boxes), points, boxes)
+    grid = {"x_range_m": ranges.x_m, "y_range_m": ranges.y_m}
+    plain = call("around.js", "turnsAround", [grid, True])[0]["result"]
+    for given, expected in ((scan, turns), (scan[:9], turns_around(ranges, camera_view=True))):
+        found = node_turns(plain, given)
+        for one, turn in zip(found, expected, strict=True):
+            np.testing.assert_allclose(one["axes"], turn.axes, atol=2e-4)  # other draws, the same plane
+
+
+def node_turns(turns: Any, scan: NDArray[np.float32]) -> Any:
+    return call("around.js", "aboutGround", [turns, float32(scan)])[0]["result"]
+
+
+def float32(points: NDArray[np.float32]) -> dict[str, list[float]]:
+    """Points as `call.mjs` takes them for a Float32Array."""
+    return {"float32": points.reshape(-1).tolist()}
+
+
+def assert_moves_alike(
+    change: Any,
+    moved: NDArray[np.float32],
+    turned: NDArray[np.float32],
+    points: NDArray[np.float32],
+    boxes: NDArray[np.float64],
+) -> None:
+    (answer,) = call("frames.js", "changePoints", [change, float32(points)])
+    np.testing.assert_array_equal(np.array(answer["result"], np.float32).reshape(-1, 4), moved)
+    found = np.array([one["result"] for one in call("frames.js", "changeBox", *([change, b] for b in boxes.tolist()))])
+    np.testing.assert_allclose(found[:, :6], turned[:, :6], atol=1e-6)
+    np.testing.assert_allclose(wrap_angle(found[:, 6] - turned[:, 6]), 0, atol=1e-6)
+
+
+def test_axes_and_heights_that_python_refuses() -> None:
+    axes = "", "x,y", "x,x,z", "z,y,x", "up", "x,y,--z", "X-forward", "x;y;z"
+    for text, answer in zip(axes, call("frames.js", "levelFrame", *([text] for text in axes)), strict=True):
+        assert answer["error"].startswith(f"axes {text}: ")
+        with pytest.raises(AscaError):
+            _ = Mounting(axes=text).level
+    heights = "high", "11", "-10.5", "nan", "1e9", "1,8", "0x1"
+    for text, answer in zip(
+        heights, call("ground.js", "sensorHeight", *([h, float32(tiny.make_scan())] for h in heights)), strict=True
+    ):
+        assert answer["error"].startswith(f"sensor height {text}: give metres")
+    (unclear, plain, none) = call(
+        "ground.js", "sensorHeight", *([h, float32(tiny.make_scan()[:9])] for h in ("auto", "1.8", ""))
+    )
+    assert unclear["error"].startswith("the sensor's height cannot be estimated: too few points")
+    assert plain == {"result": 1.8} and none == {}
+
+
+def test_the_ground_and_the_height_above_it_are_those_of_python() -> None:
+    scan = read_scan(sample_scan_path()).points
+    rng = np.random.default_rng(0)
+    sloping = rng.uniform(-25, 25, (20_000, 4)).astype(np.float32)
+    sloping[:, 2] = 0.02 * sloping[:, 0] - 1.4 + rng.normal(0, 0.02, len(sloping))
+    steep, cloud = sloping * np.array([1, 1, 8, 1], np.float32), rng.uniform(-20, 20, (20_000, 4)).astype(np.float32)
+    scans = [scan, sloping, steep, cloud]
+    for points, answer in zip(scans, call("ground.js", "groundPlane", *([float32(p)] for p in scans)), strict=True):
+        expected, found = fit_ground_plane(points), answer["result"]
+        assert expected is not None
+        assert ("doubt" in found) == (expected.doubt is not None)
+        if expected.doubt is None:
+            assert found["height"] == pytest.approx(expected.height_m, abs=0.01)
+            np.testing.assert_allclose(found["normal"], expected.normal, atol=2e-4)
+    (height,) = call("ground.js", "sensorHeight", ["auto", float32(scan)])
+    assert height["result"] == pytest.approx(estimate_height([scan]).height_m, abs=0.01)
+
+
+@pytest.mark.parametrize("camera_view", [True, False])
+def test_as_many_passes_or_as_wide_ranges_as_python_takes(camera_view: bool) -> None:
+    grids = [((0.0, 69.12), (-30.72, 30.72)), ((-51.2, 51.2), (-51.2, 51.2)), ((0.0, 40.0), (-40.0, 40.0))]
+    grids += [((-20.0, 60.0), (-40.0, 40.0)), ((2.0, 40.0), (-10.0, 40.0))]
+    calls = [[{"x_range_m": x, "y_range_m": y}, camera_view] for x, y in grids]
+    for (x, y), answer in zip(grids, call("around.js", "turnsAround", *calls), strict=True):
+        expected = turns_around(Ranges(x, y, (-3.0, 1.0)), camera_view=camera_view)
+        np.testing.assert_allclose([turn["axes"] for turn in answer["result"]], [t.axes for t in expected], atol=1e-12)
+    assert "error" in call("around.js", "turnsAround", [{"x_range_m": [0, 9], "y_range_m": [1, 9]}, camera_view])[0]
+    for name in MODELS:
+        bundle = load_pillar_bundle(shipped_bundles()[name])
+        manifest = json.loads((shipped_bundles()[name] / "bundle.json").read_text())
+        manifest["expected_input"]["camera_view"] = camera_view
+        found = call("around.js", "widened", [manifest])[0]["result"]
+        looked = widened(replace(bundle, expected_input=replace(bundle.expected_input, camera_view=camera_view)))
+        assert isinstance(looked, PillarBundle)
+        limits, grid = looked.spec.limits, looked.spec.grid
+        assert found["grid"] | {"x_range_m": [*grid.x_range_m], "y_range_m": [*grid.y_range_m]} == found["grid"]
+        assert found["limits"]["max_pillars"] == limits.max_pillars
+        assert (looked.spec == bundle.spec) == (camera_view or bundle.pillar.neck == "dense")
+
+
+def test_boxes_of_several_passes_are_merged_as_by_python() -> None:
+    rng = np.random.default_rng(3)
+    turns = turns_around(Ranges((0.0, 69.12), (-30.72, 30.72), (-3.0, 1.0)), camera_view=True)
+    passes, found = [], []
+    for turn in turns:
+        boxes = np.column_stack([rng.uniform(-12, 12, (60, 3)), rng.uniform(1, 5, (60, 3)), rng.uniform(-3, 3, 60)])
+        one = Detections(
+            boxes.astype(np.float32), rng.random(60).astype(np.float32), rng.integers(0, 2, 60), ("Car", "Van")
+        )
+        passes.append(one)
+        off_ahead = np.abs(np.arctan2(one.boxes[:, 1], one.boxes[:, 0]))
+        rows = zip(turn.inverse.boxes(one.boxes), one.scores, one.labels, off_ahead, strict=True)
+        found += [
+            {"box": box.tolist(), "score": float(score), "label": int(label), "offAhead": float(angle)}
+            for box, score, label, angle in rows
+        ]
+    expected = merge(passes, turns, 0.1)
+    answer = call("around.js", "merge", [found, {"passes": len(turns), "iou": 0.1}])[0]["result"]
+    assert 10 < len(expected) < 100
+    np.testing.assert_array_equal(np.array([one["box"] for one in answer], np.float32), expected.boxes)
+    assert [one["label"] for one in answer] == expected.labels.tolist()
 
 
 def test_the_ground_of_the_color_ramp_is_that_of_the_pictures() -> None:

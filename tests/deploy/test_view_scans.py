@@ -95,7 +95,7 @@ def test_the_page_gets_points_and_the_boxes_that_the_detector_finds(server: Scan
     np.testing.assert_array_equal(np.array([one["box"] for one in found["detections"]], np.float32), expected.boxes)
     assert found["save"]["boxes"] == expected.to_dicts()
     assert found["save"]["made_by"] == dict(expected.made_by)
-    assert found["counts"]["points"] == len(POINTS) and found["timesMs"].keys() == expected.report.times_ms.keys()
+    assert found["save"]["points"] == len(POINTS) and found["timesMs"].keys() == expected.report.times_ms.keys()
 
 
 def shown(page: Any, found: Any) -> list[Any]:

@@ -86,3 +86,18 @@ def test_a_trail_fades_to_its_oldest_place():
     greens = image[:, 380:420, 1].astype(int) - image[:, 380:420, 2]
     rows = np.flatnonzero(greens.max(axis=1) > 20)
     assert greens[rows[0] : rows[0] + 10].max() > 2 * greens[rows[-1] - 10 : rows[-1] + 1].max()
+
+
+@pytest.mark.parametrize("ranges", [AHEAD, AROUND])
+@pytest.mark.parametrize("x_m", [-4.5, -4.0, -3.0])
+def test_the_score_of_a_box_leaves_the_arrow_of_the_sensor_free(ranges, x_m):
+    """A car behind the sensor, over whose roof the camera sees it: its score would stand on the arrow."""
+    box = np.array([[x_m, 0, -0.9, 4, 1.8, 1.6, 0]])
+    plain, scored, nothing = (
+        draw_chase(NO_POINTS, [BoxLayer("a", one, (0, 0, 255), texts)], ranges, ground_m=-1.73)[80:]
+        for one, texts in ((box, [""]), (box, ["0.88"]), (box[:0], []))
+    )
+    arrow = (nothing == 255).all(axis=-1)
+    assert arrow.sum() > 100
+    np.testing.assert_array_equal(scored[arrow], plain[arrow])
+    assert (scored != plain).any(axis=-1).sum() > 100  # the score is elsewhere

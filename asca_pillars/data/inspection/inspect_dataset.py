@@ -216,7 +216,7 @@ def _class_facts(frames: Sequence[FrameMeasure], index: int, detector: Inspected
     return ClassFacts(
         name=spec.name,
         boxes=len(boxes),
-        points=_spread(points),
+        points=spread(points),
         no_points=int((points == 0).sum()),
         few_points=int((points < min_points).sum()),
         size_m=tuple(boxes[:, 3:6].mean(axis=0).tolist()) if len(boxes) else None,
@@ -258,7 +258,7 @@ def _scan_facts(scans: Sequence[ScanMeasure], spec: InspectedSpec) -> ScanFacts:
         reflectance_scales=tuple(sorted(Counter(column["reflectance_scale"].tolist()).items())),
         above_scale_share=float(column["above_scale"].mean()),
         reflectance=_some(column["reflectance"]),
-        ground_z_m=_spread(ground[np.isfinite(ground)]),
+        ground_z_m=spread(ground[np.isfinite(ground)]),
         anchor_bottoms_m=(min(bottoms), max(bottoms)),
         cell=kind.name,
         cells=_some(cells),
@@ -269,7 +269,8 @@ def _scan_facts(scans: Sequence[ScanMeasure], spec: InspectedSpec) -> ScanFacts:
     )
 
 
-def _spread(values: NDArray[np.number]) -> Spread | None:
+def spread(values: NDArray[np.number]) -> Spread | None:
+    """The percentiles of values (N,) of any unit; None without any."""
     return _some(values) if len(values) else None
 
 

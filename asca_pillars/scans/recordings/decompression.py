@@ -6,6 +6,7 @@ A few kilobytes can decompress to more than memory holds. The limit grows with t
 import shutil
 import tempfile
 from pathlib import Path
+from typing import IO, Any
 
 from rich.progress import Progress
 
@@ -13,7 +14,8 @@ from asca_pillars.base.errors import ScanError
 from asca_pillars.scans.recordings.recording import reason
 
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
-ZSTD_SUFFIXES = (".zstd", ".zst")
+UNPACKERS = {".zstd": "zstd -d", ".zst": "zstd -d", ".bz2": "bunzip2", ".gz": "gunzip", ".lz4": "lz4 -d"}
+"""Suffixes of compressed files that are read, and the program that unpacks them."""
 MAX_BYTES, MAX_RATIO = 2**27, 32
 """A message or a chunk of messages unpacks to the larger one of so many bytes and so many times its own length."""
 MAX_FILE_BYTES, MAX_FILE_RATIO = 2**28, 100
@@ -22,7 +24,7 @@ _SHOWN_BYTES = 2**28  # compressed files from this size on show their progress
 
 
 def decompress_file(source: Path) -> Path:
-    """Decompress a file of zstd into a temporary folder of its own, which the caller removes.
+    """Decompress a file of one of UNPACKERS into a temporary folder of its own, which the caller removes.
 
     Returns:
         path of the copy, which has the name of the file without its last suffix.
@@ -37,11 +39,13 @@ def decompress_file(source: Path) -> Path:
         shutil.rmtree(folder, ignore_errors=True)
         if isinstance(error, ScanError) or not isinstance(error, Exception):
             raise
-        if isinstance(error, OSError):
+        if isinstance(error, OSError) and error.errno is not None:  # gzip and bz2 say of damage that it is an OSError
             raise ScanError(
                 f"{source}: cannot be unpacked to {folder.parent} ({error.strerror}); set TMPDIR to a folder with room"
             ) from None
-        raise ScanError(f"{source}: no readable file of zstd ({reason(error)}); copy or record it again") from None
+        raise ScanError(
+            f"{source}: no readable {source.suffix} file ({reason(error)}); copy or record it again"
+        ) from None
     return folder / source.stem
 
 
@@ -119,12 +123,13 @@ def _within_limit(unpacked: bytes, packed_bytes: int) -> bytes:
 
 def _decompress_file(source: Path, target: Path) -> None:
     """Decompress as much as is whole: whoever reads the copy says what is missing from its end."""
-    from zstandard import ZstdDecompressor, ZstdError, frame_content_size
+    from zstandard import frame_content_size
 
     packed_bytes = source.stat().st_size
     limit = max(MAX_FILE_BYTES, MAX_FILE_RATIO * packed_bytes)
     with source.open("rb") as packed, target.open("wb") as unpacked:
-        stated = frame_content_size(packed.read(18))  # the longest header of a frame
+        # 18 bytes are the longest header of a frame of zstd.
+        stated = frame_content_size(packed.read(18)) if UNPACKERS[source.suffix.lower()] == "zstd -d" else -1
         _refuse_file(source, stated, limit)
         room = shutil.disk_usage(target.parent).free
         if stated > room:
@@ -136,23 +141,43 @@ def _decompress_file(source: Path, target: Path) -> None:
         written = 0
         with (
             Progress(transient=True, disable=packed_bytes < _SHOWN_BYTES) as progress,
-            ZstdDecompressor().stream_reader(packed, read_across_frames=True, closefd=False) as stream,
+            _stream(packed, source.suffix.lower()) as stream,
         ):
             task = progress.add_task(f"Unpacking {source.name}", total=packed_bytes)
             try:
-                while block := stream.read(_BLOCK_BYTES):
+                while block := stream.read1(_BLOCK_BYTES):  # what is whole before damage, too
                     written += len(block)
                     _refuse_file(source, written, limit)
                     unpacked.write(block)
                     progress.update(task, completed=packed.tell())
-            except ZstdError:
-                if not written:
+            except Exception as error:  # each library has errors of its own
+                is_damage = not isinstance(error, ScanError) and getattr(error, "errno", None) is None
+                if not (is_damage and written):
                     raise
+
+
+def _stream(packed: IO[bytes], suffix: str) -> Any:
+    """The unpacked bytes of a file, frame after frame where there are several."""
+    if suffix == ".bz2":
+        import bz2
+
+        return bz2.open(packed)
+    if suffix == ".gz":
+        import gzip
+
+        return gzip.open(packed)
+    if suffix == ".lz4":
+        import lz4.frame
+
+        return lz4.frame.open(packed)
+    from zstandard import ZstdDecompressor
+
+    return ZstdDecompressor().stream_reader(packed, read_across_frames=True, closefd=False)
 
 
 def _refuse_file(source: Path, size: int, limit: int) -> None:
     if size > limit:
         raise ScanError(
             f"{source}: unpacks to more than {limit} bytes, {MAX_FILE_RATIO} times its size or more; if that is right, "
-            "unpack it yourself (zstd -d) and give the result"
+            f"unpack it yourself ({UNPACKERS[source.suffix.lower()]}) and give the result"
         )

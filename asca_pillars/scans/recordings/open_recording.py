@@ -8,7 +8,7 @@ from pathlib import Path
 from asca_pillars.base.errors import ScanError
 from asca_pillars.base.input_files import require_content
 from asca_pillars.scans.find_scans import is_scan, natural_order, visible_files
-from asca_pillars.scans.recordings.decompression import ZSTD_SUFFIXES, decompress_file
+from asca_pillars.scans.recordings.decompression import UNPACKERS, decompress_file
 from asca_pillars.scans.recordings.mcap_files import McapRecording
 from asca_pillars.scans.recordings.packet_files import PacketCapture
 from asca_pillars.scans.recordings.recording import Recording
@@ -67,6 +67,8 @@ def _open_rosbag2(folder: Path, there: list[Path], metadata: BagMetadata) -> Rec
     """The files that are listed, or all if none of them is there; what is wrong with some does not lose the others."""
     by_name = {_unpacked_name(path.name): path for path in there}
     listed = {name: by_name.get(_unpacked_name(name)) for name in metadata.files}
+    if packed := [name for name, file in listed.items() if file is None and (folder / name).is_file()]:
+        raise ScanError(f"{folder}: {packed[0]} is packed, and {', '.join(UNPACKERS)} are read; unpack it there")
     troubles = [f"{folder}: {name} is missing" for name, file in listed.items() if file is None]
     if len(troubles) == len(listed):
         troubles, listed = [], {file.name: file for file in there}
@@ -88,7 +90,7 @@ def _open_file(path: Path) -> Recording:
         if path.stat().st_size == 0:
             raise ScanError(f"{path}: the file is empty (0 bytes); copy or record it again")
         reader = _READERS[_recorded_suffix(path)]
-        if path.suffix.lower() not in ZSTD_SUFFIXES:
+        if path.suffix.lower() not in UNPACKERS:
             return reader(path, None)
         copy = decompress_file(path)
         try:
@@ -98,6 +100,7 @@ def _open_file(path: Path) -> Recording:
             raise
     except OSError as error:
         raise ScanError(f"{path}: cannot be read ({error.strerror or error}); check the path") from None
+    recording.notes = (f"{path}: unpacked to {copy.parent} for this run ({copy.stat().st_size / 2**20:.1f} MiB)",)
     weakref.finalize(recording, shutil.rmtree, copy.parent, ignore_errors=True)
     return recording
 
@@ -109,7 +112,7 @@ def _recorded_suffix(path: Path) -> str:
 
 def _unpacked_name(name: str) -> str:
     """The name of a file without the suffix of its compression."""
-    return Path(name).stem if Path(name).suffix.lower() in ZSTD_SUFFIXES else name
+    return Path(name).stem if Path(name).suffix.lower() in UNPACKERS else name
 
 
 def _files(folder: Path) -> list[Path]:

@@ -1,4 +1,4 @@
-"""Point clouds of other types than PointCloud2: sensor_msgs/PointCloud, Livox' CustomMsg, foxglove.PointCloud.
+"""Messages of other makers' types: sensor_msgs/PointCloud, Livox' CustomMsg, foxglove.PointCloud and CompressedImage.
 
 The layouts are those of their public definitions (common_interfaces, livox_ros_driver2, foxglove/schemas).
 """
@@ -102,6 +102,24 @@ def foxglove_cloud(message: Message) -> Any:
         header=header, height=1, width=count, point_step=stride, row_step=count * stride, is_bigendian=False,
         fields=fields, data=np.frombuffer(data, np.uint8)[: count * stride], pose=content["pose"],
     )  # fmt: skip
+
+
+def foxglove_image(message: Message) -> Any:
+    """A stored foxglove.CompressedImage, JSON or Protobuf, as an object with the fields of sensor_msgs/CompressedImage.
+
+    Raises:
+        Exception: it is damaged.
+    """
+    if message.encoding == "json":
+        content = json.loads(message.data)
+        time, data = content.get("timestamp") or {}, base64.b64decode(content["data"], validate=True)
+        sec, nanosec, format_ = int(time.get("sec", 0)), int(time.get("nsec", 0)), str(content.get("format", ""))
+    else:
+        fields = dict(_wire(message.data))
+        stamp, data = dict(_wire(fields.get(1, b""))), fields.get(2, b"")
+        sec, nanosec, format_ = stamp.get(1, 0), stamp.get(2, 0), fields.get(3, b"").decode(errors="replace")
+    header = SimpleNamespace(stamp=SimpleNamespace(sec=sec, nanosec=nanosec))
+    return SimpleNamespace(header=header, format=format_, data=data)
 
 
 def posed(points: StoredPoints, pose: Any) -> StoredPoints:

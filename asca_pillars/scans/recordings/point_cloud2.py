@@ -23,6 +23,8 @@ class PointCloud(NamedTuple):
     time_ns: int
     """The header's time, or if that is 0 or less the recording's; 0, with a remark, if neither is usable."""
     frame_id: str
+    fields: tuple[str, ...] = ()
+    """Names of the fields of a point, where the message lists them."""
 
 
 def read_point_cloud(message: Message, source: str, kind: ScanKind = "PointCloud2") -> PointCloud:
@@ -39,7 +41,7 @@ def read_point_cloud(message: Message, source: str, kind: ScanKind = "PointCloud
     if not message.data:
         raise ScanError(f"{source}: the message has no data; record it again")
     try:
-        header, points = _read(message, source, kind)
+        header, points, fields = _read(message, source, kind)
     except ScanError:
         raise
     except Exception as error:  # the library lets struct's and NumPy's errors pass
@@ -49,23 +51,22 @@ def read_point_cloud(message: Message, source: str, kind: ScanKind = "PointCloud
     if time_ns is None:
         said = "neither the header nor the recording has a usable time stamp, it was taken as 0"
         points, time_ns = points._replace(remarks=(*points.remarks, said)), 0
-    return PointCloud(points, time_ns, str(header.frame_id))
+    return PointCloud(points, time_ns, str(header.frame_id), fields)
 
 
-def _read(message: Message, source: str, kind: ScanKind) -> tuple[Any, StoredPoints]:
+def _read(message: Message, source: str, kind: ScanKind) -> tuple[Any, StoredPoints, tuple[str, ...]]:
+    """Header, points, and the names of the fields where the message lists them."""
     if kind == "Packets":
-        return packed_points(message)
+        return *packed_points(message), ()
     if kind == "Velodyne":
-        return velodyne_scan(message)
+        return *velodyne_scan(message), ()
     if kind == "PointCloud":
-        return point_cloud(message)
+        return *point_cloud(message), ()
     if kind == "Livox":
-        return livox_cloud(message)
-    if kind == "Foxglove":
-        cloud = foxglove_cloud(message)
-        return cloud.header, posed(point_cloud_points(cloud, source), cloud.pose)
-    cloud = decoded(message, "sensor_msgs/msg/PointCloud2")
-    return cloud.header, point_cloud_points(cloud, source)
+        return *livox_cloud(message), ()
+    cloud = foxglove_cloud(message) if kind == "Foxglove" else decoded(message, "sensor_msgs/msg/PointCloud2")
+    points, fields = point_cloud_points(cloud, source), tuple(str(field.name) for field in cloud.fields)
+    return cloud.header, posed(points, cloud.pose) if kind == "Foxglove" else points, fields
 
 
 def point_cloud_points(cloud: Any, source: str) -> StoredPoints:

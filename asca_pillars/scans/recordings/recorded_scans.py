@@ -26,13 +26,17 @@ MAX_UNREADABLE = 10_000
 
 
 class RecordedScan(NamedTuple):
-    """One message of the topic: its number, its time, and its scan or why there is none."""
+    """One message of the topic: its number, its time, and its scan or why there is none.
+
+    `fields` are the names of the fields of a point, where the message lists them.
+    """
 
     number: int
     time_ns: int
     frame_id: str
     scan: Scan | None
     trouble: str | None = None
+    fields: tuple[str, ...] = ()
 
 
 class RecordedScans:
@@ -73,18 +77,19 @@ class RecordedScans:
         """The first scans with points, at most `count`; none is looked for beyond SEARCHED_MESSAGES."""
         return (finite_scan(cloud.points, self.scale.scale) for cloud in self._first(count))
 
+    def samples(self) -> Iterator[NamedPoints]:
+        """Up to SEARCHED_SCANS of the first scans with points, to estimate the sensor's height from."""
+        for number, scan in enumerate(self.first(SEARCHED_SCANS), start=1):
+            yield NamedPoints(f"scan {number} with points of {self.topic.name}", scan.points)
+
     def mounting(self, reading: ScanSettings) -> tuple[Mounting, list[str]]:
         """The sensor's mounting, with a height of "auto" by the first scans, and what a user is to know.
 
         Raises:
             ConfigError, ScanError: as `ScanSettings.mounting`.
         """
-        said = [f"{self.topic.name}: {self.topic.messages} scans", *said_of_scale(self.scale)]
-        first = enumerate(self.first(SEARCHED_SCANS), start=1)
-        samples = (
-            NamedPoints(f"scan {number} with points of {self.topic.name}", scan.points) for number, scan in first
-        )
-        mounting, estimate = reading.mounting(samples)
+        said = [*self.recording.notes, f"{self.topic.name}: {self.topic.messages} scans", *said_of_scale(self.scale)]
+        mounting, estimate = reading.mounting(self.samples())
         if estimate is not None:
             said.append(f"sensor height: {estimate}")
         return mounting, said
@@ -107,7 +112,8 @@ class RecordedScans:
                 unreadable += 1
                 yield RecordedScan(number, message.recorded_ns or 0, "", None, str(error))
                 continue
-            yield RecordedScan(number, cloud.time_ns, cloud.frame_id, finite_scan(cloud.points, self.scale.scale))
+            scan = finite_scan(cloud.points, self.scale.scale)
+            yield RecordedScan(number, cloud.time_ns, cloud.frame_id, scan, fields=cloud.fields)
 
     def _first(self, count: int) -> Iterator[PointCloud]:
         return islice(self._clouds_with_points(), count)
@@ -137,7 +143,7 @@ class RecordedScans:
             )
             raise ScanError(f"{where} to {self._frame}; there are {', '.join(self._transforms.frames)[:200]}")
         points = cloud.points._replace(xyz=transform_points(cloud.points.xyz, matrix[:3, :3], matrix[:3, 3]))
-        return PointCloud(points, cloud.time_ns, self._frame)
+        return cloud._replace(points=points, frame_id=self._frame)
 
     def _place(self, number: int) -> str:
         return f"{self.recording.path}, {self.topic.name}, message {number}"

@@ -48,11 +48,13 @@ class Recording(ABC):
         topics: all of them, by name.
         damage: what the last call of `messages` lacked, or before the first one the list of topics, and where; None:
             nothing.
+        notes: sentences for the user about how it is read.
     """
 
     path: Path
     topics: Sequence[Topic]
     damage: str | None = None
+    notes: tuple[str, ...] = ()
 
     @abstractmethod
     def messages(self, topic: str) -> Iterator[Message]:

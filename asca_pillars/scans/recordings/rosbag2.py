@@ -57,6 +57,7 @@ class SplitRecording(Recording):
     ) -> None:
         self.path, self._files, self._counts, self._trouble = path, files, counts, trouble
         self.topics = merged(topic for file in files for topic in file.topics)
+        self.notes = tuple(note for file in files for note in file.notes)
         self.damage = trouble or next((file.damage for file in files if file.damage), None)
 
     def messages(self, topic: str) -> Iterator[Message]:

@@ -1,6 +1,8 @@
 /** A bundle in ONNX Runtime: points in, boxes out. Knows no page, so that node runs it too. */
 
+import { aboutGround, turnsAround, widened } from "./around.js";
 import { decodeCandidates, suppress } from "./boxes.js";
+import { changeBox, changePoints, inverse, turnBy } from "./frames.js";
 import { makeGrid, unseenDirections } from "./grid.js";
 import { Canvas, pillarize } from "./pillars.js";
 import { NeckTableBuilder } from "./tables.js";
@@ -25,40 +27,69 @@ export class Detector {
     const detector = new Detector();
     detector.ort = ort;
     detector.manifest = manifest;
-    detector.grid = makeGrid(manifest.spec.grid);
+    detector.fields = new Map(); // by the spec
     detector.encoder = await ort.InferenceSession.create(graphs.encoder, OPTIONS);
     detector.backbone = await ort.InferenceSession.create(graphs.backbone, OPTIONS);
-    const { neck, channels, canvas, active_cells: rule } = manifest.pillar;
-    if (neck === "sparse") detector.tables = new NeckTableBuilder(detector.grid.ny, detector.grid.nx, rule);
-    else detector.canvas = new Canvas(detector.grid, channels, canvas);
     return detector;
   }
 
+  /** Where the model looks, and what it keeps from scan to scan: `spec`, `grid`, and `tables` or `canvas` of its neck. */
+  field(around) {
+    const spec = around ? widened(this.manifest) : this.manifest.spec;
+    const name = JSON.stringify(spec.grid);
+    if (!this.fields.has(name)) {
+      const { neck, channels, canvas, active_cells: rule } = this.manifest.pillar;
+      const grid = makeGrid(spec.grid);
+      const sparse = neck === "sparse";
+      const tables = sparse ? new NeckTableBuilder(grid.ny, grid.nx, rule) : undefined;
+      this.fields.set(name, { spec, grid, tables, canvas: sparse ? undefined : new Canvas(grid, channels, canvas) });
+    }
+    return this.fields.get(name);
+  }
+
   /**
-   * The boxes of one scan, best first, in the scan's frame.
-   * @param {Float32Array} points x, y, z in metres (LiDAR frame), reflectance 0..1 of each of N points
-   * @returns {Promise<{detections: object[], timesMs: object, counts: object, remarks: string[]}>}
+   * The boxes of one scan, pass by pass and the best first, in the scan's frame.
+   * @param {Float32Array} points x, y, z in metres (the model's frame), reflectance 0..1 of each of N points
+   * @param {boolean} around look in every direction; the boxes of several passes are to be merged (`around.js`)
+   * @returns {Promise<{detections: object[], passes: number, timesMs: object, counts: object, remarks: string[]}>}
    */
-  async detect(points) {
-    const { spec, pillar } = this.manifest;
-    const timesMs = {};
+  async detect(points, around = false) {
+    const field = this.field(around);
+    const turns = around ? turnsAround(field.spec.grid, this.manifest.expected_input.camera_view) : [turnBy(0)];
+    const [timesMs, detections] = [{}, []];
+    const counts = { points: 0, points_outside: 0, pillars: 0 };
+    const remarks = around ? [] : unseenDirections(field.grid, points);
+    const level = turns.length === 1 ? turns : aboutGround(turns, points);
+    for (const [pass, turn] of level.entries()) {
+      const back = inverse(turn);
+      for (const { box, ...found } of await this.pass(changePoints(turn, points), field, timesMs, counts)) {
+        detections.push({ ...found, box: changeBox(back, box), pass, offAhead: Math.abs(Math.atan2(box[1], box[0])) });
+      }
+    }
+    return { detections, passes: turns.length, timesMs, counts, remarks };
+  }
+
+  /** The boxes of one pass; adds to the times of the stages and to the counts. */
+  async pass(points, field, timesMs, counts) {
+    const { spec, grid } = field;
     const timed = async (stage, work) => {
       const start = performance.now();
       const result = await work();
-      timesMs[stage] = performance.now() - start;
+      timesMs[stage] = (timesMs[stage] ?? 0) + performance.now() - start;
       return result;
     };
-    const pillars = await timed("pillarize", () => pillarize(points, this.grid, spec.limits));
+    const pillars = await timed("pillarize", () => pillarize(points, grid, spec.limits));
     const features = await timed("encode", () => this.encode(pillars));
-    const placed = await timed(this.tables ? "tables" : "scatter", () => this.place(features, pillars.cells));
+    const placed = await timed(field.tables ? "tables" : "scatter", () => this.place(field, features, pillars.cells));
     const maps = await timed("neck+head", () => this.neckAndHead(placed));
     const found = await timed("decode", () => {
-      const yaws = pillar.layout.anchor_yaws_rad;
-      return suppress(decodeCandidates(maps, this.grid, spec, yaws, placed.headCells), spec.post);
+      const yaws = this.manifest.pillar.layout.anchor_yaws_rad;
+      return suppress(decodeCandidates(maps, grid, spec, yaws, placed.headCells), spec.post);
     });
-    const detections = found.map(({ box, score, label }) => ({ class: spec.classes[label].name, score, box }));
-    const counts = { points: points.length / 4, points_outside: pillars.outside, pillars: pillars.cells.length };
-    return { detections, timesMs, counts, remarks: unseenDirections(this.grid, points) };
+    counts.points += points.length / 4;
+    counts.points_outside += pillars.outside;
+    counts.pillars += pillars.cells.length;
+    return found.map(({ box, score, label }) => ({ class: spec.classes[label].name, score, box }));
   }
 
   /** Features of the pillars (P x C), of the canvas's type. */
@@ -73,13 +104,13 @@ export class Detector {
   }
 
   /** What backbone.onnx takes, and of a sparse neck the head cells that it answers for. */
-  place(features, cells) {
+  place(field, features, cells) {
     const { channels, canvas } = this.manifest.pillar;
-    if (!this.tables) {
-      this.canvas.scatter(features, cells);
-      return { given: { canvas: this.tensor(canvas.type, this.canvas.values, this.canvas.shape) } };
+    if (!field.tables) {
+      field.canvas.scatter(features, cells);
+      return { given: { canvas: this.tensor(canvas.type, field.canvas.values, field.canvas.shape) } };
     }
-    const { inputs, headCells } = this.tables.build(cells);
+    const { inputs, headCells } = field.tables.build(cells);
     if (headCells.length === 0) return { headCells };
     const given = { pillar_features: this.tensor(canvas.type, features, [cells.length, channels]) };
     for (const [name, table] of Object.entries(inputs)) {

@@ -74,7 +74,7 @@ export function unseenDirections(grid, points) {
   }
   if (away === 0 || behind / away < BEHIND_SHARE) return [];
   const share = Math.round((100 * behind) / away);
-  return [`${share}% of the points lie behind the sensor, where the model does not look; asca detect --around looks there.`];
+  return [`${share}% of the points lie behind the sensor, where the model does not look: look all around.`];
 }
 
 /** Index of the interval [edges[i], edges[i + 1]) around a value, for evenly spaced edges. */

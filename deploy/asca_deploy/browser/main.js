@@ -11,8 +11,8 @@ let scene;
 let detector;
 let sliders;
 let colors = {}; // of the classes, red, green, blue 0..255: those of the pictures of `asca detect`
-let last; // the file that is shown
-let found; // in it
+let last; // the file that was asked for
+let found; // in the one that is shown
 let files = []; // those that were opened together
 let position = 0;
 let busy = false;
@@ -46,34 +46,38 @@ async function start() {
 async function detect(file) {
   if (busy) return;
   busy = true;
+  last = file;
+  element("again").disabled = element("sensor").disabled = true;
   document.body.dataset.state = "busy";
   say(`${file.name}: detecting`);
+  const [axes, height] = ["axes", "height"].map((id) => element(id).value.trim());
+  const sensor = { axes, height, around: element("around").checked };
   try {
-    found = await detector.detect(file, (points) => scene.show(points, []));
-    last = file;
+    found = { name: file.name, ...(await detector.detect(file, sensor, (points) => scene.show(points, []))) };
     show();
     document.body.dataset.state = "done";
   } catch (error) {
     fail(error.message);
   } finally {
     busy = false;
-    element("again").disabled = last === undefined;
+    element("again").disabled = element("sensor").disabled = false;
   }
 }
 
-/** Draw and list what was found in the last file, from the sliders' scores on. */
+/** Draw and list what was found, from the sliders' scores on. */
 function show() {
   if (found === undefined) return;
-  const { points, remarks, timesMs, counts, save: content } = found;
-  const chosen = sliders.chosen(found.detections);
+  const { name: file, points, merging, remarks, timesMs, save: content } = found;
+  const chosen = sliders.chosen(found.detections, merging);
   const detections = chosen.map((place) => found.detections[place]);
   const colored = detections.map((one) => ({ ...one, color: colors[one.class].map((value) => value / 255) }));
   scene.show(points, colored);
   const total = Object.values(timesMs).reduce((sum, time) => sum + time, 0);
-  const seen = counts.points - counts.points_outside;
+  const seen = (content.points - content.points_outside).toLocaleString("en"); // by every pass, one after the other
+  const where = content.passes === 1 ? `${seen} within the model's ranges` : `in ${content.passes} passes`;
   say([
-    `${last.name}: ${detections.length} objects in ${total.toFixed(0)} ms.`,
-    `${counts.points.toLocaleString("en")} points, ${seen.toLocaleString("en")} within the model's ranges.`,
+    `${file}: ${detections.length} objects in ${total.toFixed(0)} ms.`,
+    `${(points.length / 4).toLocaleString("en")} points, ${where}.`,
     ...remarks,
   ].join(" "));
   const times = [...Object.entries(timesMs), ["total", total]];
@@ -84,13 +88,7 @@ function show() {
     line.addEventListener("click", () => scene.lookAt(box));
     return line;
   }));
-  const boxes = content ? chosen.map((place) => content.boxes[place]) : detections.map(plain);
-  save({ ...(content ?? { scan: last.name, times_ms: timesMs, ...counts, warnings: remarks }), boxes });
-}
-
-/** A box as `asca detect` writes it. */
-function plain({ class: name, score, box: [x, y, z, length, width, height, yaw] }) {
-  return { class: name, score, x_m: x, y_m: y, z_m: z, length_m: length, width_m: width, height_m: height, yaw_rad: yaw };
+  save({ ...content, boxes: chosen.map((place) => content.boxes[place]) });
 }
 
 function save(content) {
@@ -141,11 +139,12 @@ async function step(by) {
 
 element("file").addEventListener("change", (event) => open(event.target.files));
 document.addEventListener("keydown", (event) => {
-  if (event.target.type === "range") return; // which they move
+  if (["range", "text"].includes(event.target.type)) return; // in which they move
   if (event.key === "ArrowRight") step(1);
   if (event.key === "ArrowLeft") step(-1);
 });
 element("again").addEventListener("click", () => detect(last));
+element("sensor").addEventListener("change", () => detect(last));
 for (const kind of ["dragover", "dragleave", "drop"]) {
   document.addEventListener(kind, (event) => {
     event.preventDefault();

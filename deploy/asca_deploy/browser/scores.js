@@ -5,6 +5,8 @@
  * detector with a low threshold finds, filtered, is what it finds with a higher one.
  */
 
+import { merge } from "./around.js";
+
 export const LOWEST_SCORE = 0.1; // that the sliders reach
 const HIGHEST_SCORE = 0.95;
 
@@ -22,10 +24,19 @@ export class ScoreSliders {
     place.hidden = classes.every(({ score, lowest }) => lowest >= Math.max(score, HIGHEST_SCORE));
   }
 
-  /** The places of the boxes to show among detections, best first. */
-  chosen(detections) {
+  /**
+   * The places of the boxes to show among detections, best first.
+   * @param {object[]} detections
+   * @param {{passes: number, iou: number}} [merging] of passes whose boxes are not merged yet: a box removes others there
+   *   by its direction, not by its score, so that those below the scores have to be gone
+   */
+  chosen(detections, merging) {
     const places = detections.flatMap(({ class: name, score }, place) => (score >= this.scores[name] ? [place] : []));
-    return places.slice(0, this.limit);
+    if (!merging) return places.slice(0, this.limit);
+    const left = new Array(merging.passes).fill(this.limit);
+    const found = places.filter((place) => left[detections[place].pass]-- > 0);
+    const candidates = found.map((place) => ({ ...detections[place], label: detections[place].class, place }));
+    return merge(candidates, merging).map(({ place }) => place);
   }
 
   slider({ name, score, lowest }, changed) {

@@ -21,10 +21,11 @@ export class WorkerDetector {
   /**
    * The boxes of one file.
    * @param {{name: string, buffer: ArrayBuffer}} file
+   * @param {{axes: string, height: string, around: boolean}} sensor as `asca detect` takes it; empty: as in training
    * @param {(points: Float32Array) => void} preview called with the points, before the boxes are there
    */
-  detect(file, preview) {
-    return this.ask("detect", file, preview);
+  detect(file, sensor, preview) {
+    return this.ask("detect", { ...file, sensor }, preview);
   }
 
   ask(task, given, preview) {
@@ -47,7 +48,7 @@ export class WorkerDetector {
 
 /** The detector of `asca view`: asked for the points of a scan, then for its boxes. */
 export class ServedDetector {
-  async detect({ number }, preview) {
+  async detect({ number }, sensor, preview) {
     const points = new Float32Array(await (await fetched(`scans/${number}.bin`)).arrayBuffer());
     preview(points);
     return { points, ...(await (await fetched(`scans/${number}.json`)).json()) };

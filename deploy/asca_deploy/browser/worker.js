@@ -2,6 +2,8 @@
 
 import * as ort from "./ort.wasm.bundle.min.mjs";
 import { Detector } from "./detector.js";
+import { changeBox, changePoints, inverse, levelFrame, liftBy } from "./frames.js";
+import { sensorHeight } from "./ground.js";
 import { readScan } from "./readers.js";
 import { LOWEST_SCORE } from "./scores.js";
 
@@ -20,13 +22,30 @@ const tasks = {
     return manifest;
   },
 
-  async detect({ name, buffer }, id) {
-    const { points, remarks } = readScan(name, buffer);
+  /** Points and boxes are shown level, x ahead, about the sensor; `save` holds the boxes in the scan's frame. */
+  async detect({ name, buffer, sensor: { axes, height: given, around } }, id) {
+    const level = levelFrame(axes || "x-forward");
+    const scan = readScan(name, buffer);
+    const points = changePoints(level, scan.points);
     self.postMessage({ id, preview: points });
-    const found = await detector.detect(points);
-    return { ...found, points, remarks: [...remarks, ...found.remarks] };
+    const height = sensorHeight(given, points);
+    const trained = detector.manifest.expected_input.ground_z_m; // of the lowest and of the highest scan
+    const lift = liftBy(height === undefined || !trained ? 0 : height + (trained[0] + trained[1]) / 2);
+    const { passes, timesMs, counts, ...found } = await detector.detect(changePoints(lift, points), around);
+    const detections = found.detections.map((one) => ({ ...one, box: changeBox(inverse(lift), one.box) }));
+    const remarks = [...scan.remarks, ...found.remarks];
+    if (given === "auto") remarks.push(`The sensor is ${height.toFixed(2)} m above the ground, estimated from this scan.`);
+    const boxes = detections.map((one) => written(one.class, one.score, changeBox(inverse(level), one.box)));
+    const merging = passes > 1 ? { passes, iou: detector.manifest.spec.post.nms_iou } : undefined;
+    const save = { scan: name, times_ms: timesMs, ...counts, passes, warnings: remarks, boxes };
+    return { points, detections, merging, timesMs, remarks, save };
   },
 };
+
+/** A box as `asca detect` writes it. */
+function written(name, score, [x, y, z, length, width, height, yaw]) {
+  return { class: name, score, x_m: x, y_m: y, z_m: z, length_m: length, width_m: width, height_m: height, yaw_rad: yaw };
+}
 
 /** The spec with low scores, and no limit but that of the candidates: the page filters what suppression leaves. */
 function lowered({ classes, post, ...spec }) {

@@ -40,9 +40,11 @@ from asca_pillars.data.kitti import read_calibration
 from asca_pillars.detection.spec import ScoreThresholds
 from asca_pillars.pictures.video import VideoView
 from asca_pillars.scans.mounting import Mounting
+from asca_pillars.scans.recordings.images import NearestImages
 from asca_pillars.scans.recordings.odometry import Poses, read_poses
 from asca_pillars.scans.recordings.open_recording import open_recording, recording_files
 from asca_pillars.scans.recordings.recorded_scans import RecordedScan, RecordedScans
+from asca_pillars.scans.recordings.recording import listed
 from asca_pillars.scans.scan_settings import ScanSettings
 
 _PLAIN = RuntimeOptions()
@@ -84,6 +86,7 @@ class _Task:
     track: bool
     odometry: str | None
     calib: Path | None
+    image_topic: str | None
     files: SequenceFiles
 
 
@@ -98,6 +101,7 @@ def detect_recording(
     calib: str | Path | None = None,
     foxglove: str | Path | None = None,
     rerun: str | Path | None = None,
+    image_topic: str | None = None,
     video: str | Path | None = None,
     video_view: VideoView = "above",
     options: RuntimeOptions = _PLAIN,
@@ -119,7 +123,8 @@ def detect_recording(
         odometry: with `track`, the topic of the car's poses; None: velocities are as the car sees them.
         calib: KITTI calibration, for KITTI's tracking text in `out`.
         foxglove: an .mcap to write for Foxglove.
-        rerun: an .rrd to write for the rerun viewer.
+        rerun: an .rrd to write for the rerun viewer, with the camera image nearest to each scan if there are images.
+        image_topic: with `rerun`, the topic of these; None: the first one that has images.
         video: an .mp4 to write, boxes with their tracks.
         video_view: from above, or "chase" in 3D.
         options: which model runs, and how.
@@ -143,6 +148,7 @@ def detect_recording(
         track=track,
         odometry=odometry,
         calib=None if calib is None else Path(calib),
+        image_topic=image_topic,
         files=SequenceFiles(
             foxglove=None if foxglove is None else Path(foxglove),
             rerun=None if rerun is None else Path(rerun),
@@ -162,6 +168,8 @@ def _detect(task: _Task, reading: ScanSettings, options: RuntimeOptions, reporte
     topic = recording.point_cloud_topic(task.topic)
     if task.odometry is not None and not task.track:
         raise ConfigError(f"--odometry {task.odometry}: is for tracks; give --track, too")
+    if task.image_topic is not None and task.files.rerun is None:
+        raise ConfigError(f"--image-topic {task.image_topic}: is shown in the file of --rerun; give that, too")
     if task.frame is not None and (reading.pose is not None or reading.axes != "x-forward"):
         raise ConfigError(f"--frame {task.frame}: says how the scans lie already; leave --axes and --pose out")
     poses = None if task.odometry is None else read_poses(recording, task.odometry)
@@ -169,6 +177,9 @@ def _detect(task: _Task, reading: ScanSettings, options: RuntimeOptions, reporte
     scans = RecordedScans(recording, topic, reading.reflectance_scale, task.frame)
     topic = scans.topic
     mounting, said = scans.mounting(reading)
+    images = None if task.files.rerun is None else NearestImages(recording, task.image_topic)
+    if images is not None and images.topic is not None and images.others:
+        said.append(f"images: of {images.topic.name}; --image-topic takes others of {listed(images.others)}")
     for line in said:
         reporter.remark(line)
     births, weak = track_thresholds(options.bundle, task.score)
@@ -195,11 +206,11 @@ def _detect(task: _Task, reading: ScanSettings, options: RuntimeOptions, reporte
             _check_times(times_ns, task, topic.name, poses, reporter)
         pose_at = None if poses is None else partial(_pose_of_scan, poses, mounting)
         results = _with_points(tracked(journal, tracker, pose_at), scans if task.files.show_points else None)
-        opened = partial(task.files.open, detector=detector, times_ns=times_ns, pose_at=pose_at)
+        opened = partial(task.files.open, detector=detector, times_ns=times_ns, pose_at=pose_at, images=images)
         scope = detector_scope(detector.spec, around=task.around)
         written, classes = _write(task, results, calibration, scope, about, opened)
         journal.remove()
-    for line in repairs(run.kept):
+    for line in (*repairs(run.kept), *(() if images is None else images.remarks())):
         reporter.remark(line)
     kitti = [] if task.calib is None else [task.out / KITTI_FILE]
     return RecordingResult(

@@ -9,12 +9,14 @@ from numpy.typing import NDArray
 
 from asca_deploy.recordings.results import Found
 from asca_pillars.pictures.colors import class_rgb, ground_height, height_rgb
+from asca_pillars.scans.recordings.images import CameraImage, NearestImages
 
 MAX_POINTS = 20_000  # points shown of a scan: a whole revolution of 120,000 takes 14 MB a second
 TIMELINE = "time"
 MOVES_MPS = 0.5
 """Speed below which tracks have no arrow."""
 _BACKGROUND = (14, 18, 24)
+_CAMERA = "camera"
 APPLICATION = "asca-pillars"
 _HEAD_BYTES = 4096  # leading bytes of a file that hold the application's name
 _FLUSH_S = 60.0
@@ -28,18 +30,22 @@ def is_own_rrd(path: Path) -> bool:
 
 
 class RerunFile:
-    """Writes an .rrd: `scan` the points, colored by height, `boxes` what was found, `velocities` of tracks.
+    """Writes an .rrd: `scan` the points, colored by height, `boxes` what was found, `velocities` of tracks, `camera`.
 
-    The viewer opens it with a 3D view of these and its panels folded. OSError if it cannot be written.
+    The viewer opens it with a 3D view of these, a 2D view of the images if there are any, and its panels folded.
+    OSError if it cannot be written.
 
     Args:
         path: to write to.
+        images: of which the nearest one to each scan is shown; None: none.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, images: NearestImages | None = None) -> None:
         import rerun as rr
 
         self._rr = rr
+        self._images = None if images is None or images.topic is None else images
+        self._image: CameraImage | None = None
         self._stream = rr.RecordingStream(APPLICATION)
         self._stream.save(path)
         self._stream.send_blueprint(self._blueprint())
@@ -59,6 +65,8 @@ class RerunFile:
         stream.log("boxes", self._boxes(found))
         if found.tracks is not None:
             stream.log("velocities", self._velocities(found))
+        if self._images is not None:
+            self._show(self._images.at(found.time_ns))
         self._flush()
 
     def finish(self) -> None:
@@ -78,8 +86,27 @@ class RerunFile:
     def _blueprint(self) -> Any:
         import rerun.blueprint as rrb
 
-        view = rrb.Spatial3DView(origin="/", name="Scan, boxes and velocities", background=_BACKGROUND)
-        return rrb.Blueprint(view, collapse_panels=True)
+        name = "Scan, boxes and velocities"
+        if self._images is None:
+            view = rrb.Spatial3DView(origin="/", name=name, background=_BACKGROUND)
+            return rrb.Blueprint(view, collapse_panels=True)
+        assert self._images.topic is not None
+        contents = ["+ $origin/**", f"- /{_CAMERA}/**"]
+        scene = rrb.Spatial3DView(origin="/", contents=contents, name=name, background=_BACKGROUND)
+        camera = rrb.Spatial2DView(origin=f"/{_CAMERA}", name=self._images.topic.name)
+        return rrb.Blueprint(rrb.Horizontal(scene, camera, column_shares=[3, 2]), collapse_panels=True)
+
+    def _show(self, image: CameraImage | None) -> None:
+        """Log an image that is not shown already; None: the one that is shown goes."""
+        shown, self._image = self._image, image
+        if image is shown:
+            return
+        if image is None:
+            self._stream.log(_CAMERA, self._rr.Clear(recursive=False))
+        elif isinstance(image.content, bytes):
+            self._stream.log(_CAMERA, self._rr.EncodedImage(contents=image.content, media_type=image.kind))
+        else:
+            self._stream.log(_CAMERA, self._rr.Image(image.content, color_model=image.kind))
 
     def _velocities(self, found: Found) -> Any:
         """Return an arrow for each moving track, as long as its way of one second, from the center of its roof."""

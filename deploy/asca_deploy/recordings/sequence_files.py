@@ -19,6 +19,7 @@ from asca_pillars.base.extras import require
 from asca_pillars.base.files import atomic_path
 from asca_pillars.base.writable_file import require_suffix, require_writable
 from asca_pillars.pictures.video import VideoView
+from asca_pillars.scans.recordings.images import NearestImages
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,6 +64,7 @@ class SequenceFiles:
         detector: Detector,
         times_ns: Sequence[int],
         pose_at: Callable[[int], NDArray[np.float64]] | None = None,
+        images: NearestImages | None = None,
     ) -> list[ResultFile]:
         """Open the files.
 
@@ -72,6 +74,7 @@ class SequenceFiles:
             detector: that finds the boxes.
             times_ns: of all scans; the video runs as fast as these.
             pose_at: the pose of a scan at a time in nanoseconds, 4x4; None: it is not known.
+            images: of a camera, for rerun; None: none.
         """
         files: list[ResultFile] = []
         if self.foxglove is not None:
@@ -80,7 +83,7 @@ class SequenceFiles:
             handles.callback(foxglove.finish)
             files.append(foxglove)
         if self.rerun is not None:
-            rerun = RerunFile(places.enter_context(atomic_path(self.rerun)))
+            rerun = RerunFile(places.enter_context(atomic_path(self.rerun)), images)
             handles.callback(rerun.finish)
             files.append(rerun)
         if self.video is not None:

@@ -77,11 +77,14 @@ def write_mcap(
     others: dict[str, str] | None = None,
     odometry: list[tuple[int, Any]] | None = None,
     transforms: list[Any] | None = None,
+    images: dict[str, tuple[str, str, list[tuple[int, bytes]]]] | None = None,
     chunk_size: int = 2000,
     has_schema: bool = True,
     **options: Any,
 ) -> Path:
     """An MCAP with topics of (time, PointCloud2 message or raw bytes); `others` are topics of other types.
+
+    `images` are topics of (type, encoding, (time, raw bytes)).
 
     `options` are those of the writer.
     """
@@ -102,6 +105,10 @@ def write_mcap(
         for topic, kind in (others or {}).items():
             other = writer.register_channel(topic, "cdr", writer.register_schema(kind, "ros2msg", b"string data"))
             writer.add_message(other, START_NS, b"\x00\x01\x00\x00\x01\x00\x00\x00\x00", START_NS)
+        for topic, (kind, encoding, stored) in (images or {}).items():
+            channel = writer.register_channel(topic, encoding, writer.register_schema(kind, "", b""))
+            for time_ns, content in stored:
+                writer.add_message(channel, time_ns, content, time_ns)
         if odometry:
             data, _ = one.generate_msgdef(ODOMETRY, ros_version=2)
             channel = writer.register_channel(
@@ -155,6 +162,30 @@ def odometry_message(
         pose=types["geometry_msgs/msg/PoseWithCovariance"](pose=pose, covariance=covariance),
         twist=types["geometry_msgs/msg/TwistWithCovariance"](twist=twist, covariance=covariance),
     )
+
+
+def image_message(
+    time_ns: int, pixels: NDArray[np.uint8], encoding: str, *, padding: int = 0, ros1: bool = False
+) -> Any:
+    """A sensor_msgs/Image of pixels (height, width, channels) with so many bytes behind each row."""
+    types = store(ros1).types
+    height, width, channels = pixels.shape
+    rows = np.pad(pixels.reshape(height, -1), ((0, 0), (0, padding)))
+    stamp = types["builtin_interfaces/msg/Time"](sec=time_ns // 10**9, nanosec=time_ns % 10**9)
+    return types["sensor_msgs/msg/Image"](
+        header=types["std_msgs/msg/Header"](**({"seq": 0} if ros1 else {}), stamp=stamp, frame_id="camera"),
+        height=height, width=width, encoding=encoding, is_bigendian=0, step=width * channels + padding,
+        data=rows.reshape(-1),
+    )  # fmt: skip
+
+
+def compressed_image(time_ns: int, content: bytes, format_: str = "jpeg") -> bytes:
+    """A sensor_msgs/CompressedImage in CDR."""
+    one = store()
+    stamp = one.types["builtin_interfaces/msg/Time"](sec=time_ns // 10**9, nanosec=time_ns % 10**9)
+    header = one.types["std_msgs/msg/Header"](stamp=stamp, frame_id="camera")
+    kind = "sensor_msgs/msg/CompressedImage"
+    return bytes(one.serialize_cdr(one.types[kind](header, format_, np.frombuffer(content, np.uint8)), kind))
 
 
 def clouds(count: int, points: int = 50) -> list[tuple[int, Any]]:

@@ -2,6 +2,7 @@
 
 import bz2
 import gc
+import gzip
 import io
 import shutil
 import tempfile
@@ -25,7 +26,8 @@ from asca_pillars.scans.recordings import decompression
 from asca_pillars.scans.recordings.decompression import decompress_bz2, decompress_lz4, decompress_zstd
 from asca_pillars.scans.recordings.open_recording import is_recording, open_recording
 from asca_pillars.scans.recordings.recorded_scans import RecordedScan, RecordedScans
-from tests.scans.recordings.cloud_recordings import CLOUD, cloud_points, clouds, stamps, store, write_mcap
+from asca_pillars.scans.scan_settings import ScanSettings
+from tests.scans.recordings.cloud_recordings import CLOUD, cloud_points, clouds, laid_out, stamps, store, write_mcap
 from tests.scans.recordings.decompression_bombs import zstd_zeros
 
 DATA = np.random.default_rng(0).integers(0, 9, 300_000, np.uint8).tobytes()
@@ -112,14 +114,65 @@ def test_what_the_user_unpacked_is_read_instead(tmp_path: Path) -> None:
     assert len(scans(folder)) == 3
 
 
-@pytest.mark.parametrize("suffix", [".mcap.zst", ".bag.zstd", ".BAG.ZST"])
-def test_files_that_were_packed_afterwards(tmp_path: Path, suffix: str) -> None:
-    if suffix == ".mcap.zst":
+PACK = {
+    ".zst": zstandard.compress,
+    ".zstd": zstandard.compress,
+    ".bz2": bz2.compress,
+    ".gz": gzip.compress,
+    ".lz4": lz4.frame.compress,
+}
+
+
+@pytest.mark.parametrize("suffix", [*PACK, ".ZST", ".GZ"])
+@pytest.mark.parametrize("kind", [".mcap", ".bag", ".BAG"])
+def test_files_that_were_packed_afterwards(tmp_path: Path, kind: str, suffix: str) -> None:
+    if kind == ".mcap":
         plain = write_mcap(tmp_path / "a.mcap", {"/lidar": clouds(3)})
     else:
         plain = rosbag1(tmp_path / "a.bag", Writer1.CompressionFormat.LZ4)
-    (tmp_path / f"b{suffix}").write_bytes(zstandard.compress(plain.read_bytes()))
-    assert [one.time_ns for one in scans(tmp_path / f"b{suffix}")] == stamps(3)
+    data, pack = plain.read_bytes(), PACK[suffix.lower()]
+    packed = tmp_path / f"b{kind}{suffix}"
+    packed.write_bytes(pack(data[:1000]) + pack(data[1000:]))  # in two frames, as of programs that pack in parallel
+    assert is_recording(packed) and [one.time_ns for one in scans(packed)] == stamps(3)
+
+
+@pytest.mark.parametrize("suffix", PACK)
+def test_files_with_damage(tmp_path: Path, suffix: str) -> None:
+    """What lies before it is read; what is not packed at all is refused."""
+    noise = np.random.default_rng(0)
+    messages = [(time_ns, laid_out(noise.random((5000, 4), np.float32), time_ns=time_ns)) for time_ns in stamps(40)]
+    data = write_mcap(tmp_path / "a.mcap", {"/lidar": messages}, use_chunking=False).read_bytes()
+    packed = PACK[suffix](data)
+    path = tmp_path / f"b.mcap{suffix}"
+    for damaged in (packed[: len(packed) // 2], packed[: len(packed) // 2] + bytes(len(packed) // 2)):
+        path.write_bytes(damaged)
+        recording = open_recording(path)
+        # bzip2's blocks have 0.9 MB, a frame of LZ4 at most 4.
+        count = sum(1 for _ in recording.messages("/lidar"))
+        assert 5 <= count < 40
+        assert recording.damage is not None and recording.damage.startswith(f"{path}: ends early")
+    path.write_bytes(b"not packed")
+    with pytest.raises(ScanError, match=rf"b\.mcap{suffix}: no readable {suffix} file .*; copy or record it again$"):
+        open_recording(path)
+
+
+def test_unpacking_is_said(tmp_path: Path) -> None:
+    folder = rosbag2(tmp_path / "bag", "MCAP", "FILE")
+    recording = open_recording(folder)
+    _, said = RecordedScans(recording, recording.point_cloud_topic(), 1.0).mounting(ScanSettings())
+    assert said[0].startswith(f"{folder / 'bag.mcap.zstd'}: unpacked to {tempfile.gettempdir()}/asca-unpacked-")
+    assert said[1] == "/lidar: 3 scans"
+    (folder / "bag.mcap").write_bytes(decompress_zstd((folder / "bag.mcap.zstd").read_bytes()))
+    assert open_recording(folder).notes == ()
+
+
+def test_a_packing_that_is_not_read_is_named(tmp_path: Path) -> None:
+    folder = rosbag2(tmp_path / "bag", "MCAP", "FILE")
+    (folder / "bag.mcap.zstd").rename(folder / "bag.mcap.brotli")
+    metadata = folder / "metadata.yaml"
+    metadata.write_text(metadata.read_text().replace("bag.mcap.zstd", "bag.mcap.brotli"))
+    with pytest.raises(ScanError, match=r"bag: bag\.mcap\.brotli is packed, and \.zstd, .* are read; unpack it"):
+        open_recording(folder)
 
 
 def test_copies_are_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -159,6 +212,9 @@ def test_files_that_unpack_to_gigabytes_are_refused(
     (tmp_path / name).write_bytes(zstd_zeros(2**33, stated=stated))
     with pytest.raises(ScanError, match=rf"{name}: unpacks to more than .* unpack it yourself \(zstd -d\)"):
         open_recording(tmp_path / name)
+    (tmp_path / "a.mcap.gz").write_bytes(gzip.compress(bytes(2**25)))
+    with pytest.raises(ScanError, match=r"a\.mcap\.gz: unpacks to more than .* unpack it yourself \(gunzip\)"):
+        open_recording(tmp_path / "a.mcap.gz")
 
 
 def test_a_full_disk_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,0 +1,323 @@
+"""Describes scans without labels, files or a recording, and compares them with those that a model was trained on."""
+
+import math
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from asca_deploy.around import ranges_around, turns_around, widened
+from asca_deploy.detect_scans import repairs_of
+from asca_deploy.detector import usable_points
+from asca_deploy.manifest import load_bundle
+from asca_deploy.recordings.results import said_of_stamps
+from asca_deploy.shipped import find_bundle
+from asca_pillars.base.errors import ConfigError, ScanError
+from asca_pillars.base.extras import require
+from asca_pillars.base.progress import Progress, Reporter
+from asca_pillars.data.inspection.inspect_dataset import Spread, spread
+from asca_pillars.detection.detections import ScanCounts
+from asca_pillars.geometry.frame_change import FrameChange
+from asca_pillars.geometry.ranges import Ranges
+from asca_pillars.scans.expected_input import ExpectedInput
+from asca_pillars.scans.find_scans import name_scans
+from asca_pillars.scans.ground_height import HeightEstimate, NamedPoints
+from asca_pillars.scans.input_check import check_input, ground_z_m
+from asca_pillars.scans.mounting import Mounting
+from asca_pillars.scans.recordings.open_recording import is_recording, open_recording
+from asca_pillars.scans.recordings.recorded_scans import RecordedScan, RecordedScans
+from asca_pillars.scans.recordings.recording import Topic
+from asca_pillars.scans.scan_input import ScanInput, said_of_scale
+from asca_pillars.scans.scan_reader import Scan, ScanNotes
+from asca_pillars.scans.scan_settings import ScanSettings, sample_points
+
+FRAMES = 500
+GAP = 1.5
+"""Two scans further apart than so many times the median step have a gap between them."""
+_AS_TRAINED = ScanSettings()
+
+
+@dataclass(frozen=True)
+class ScanTimes:
+    """Time stamps of a recording's scans. Missing are those that would fill the gaps at the usual rate."""
+
+    seconds: float
+    """From the earliest to the latest."""
+    rate_hz: float | None
+    """By the median step; None where no two scans follow each other."""
+    gaps: int
+    missing: int
+    longest_gap_s: float
+    longest_gap_after: int
+    """Number of the scan before the longest gap."""
+
+
+@dataclass(frozen=True)
+class ScansInspection:
+    """Scans without labels.
+
+    Attributes:
+        path: file, folder or recording.
+        model: name of the bundle that they are compared with.
+        expected: statistics of the scans that it was trained on.
+        ranges: where it looks, in its frame.
+        topics: of a recording; of files none.
+        topic: of the scans; None for files.
+        fields: names of a point's fields, where the messages list them.
+        frame_ids: of the scans' headers.
+        times: None for files.
+        scans: how many there are.
+        inspected: how many of them were measured, evenly spaced; those that cannot be read are left out.
+        points: finite points of a scan. The other measurements are None where no scan has points.
+        not_finite: points that were dropped, in all scans that were measured.
+        reflectance_scales: stored values that were taken as a reflectance of 1; none where there are no reflectances.
+        reflectance: mean of a scan, 0..1.
+        ground_z_m: height of the ground near the sensor, in the model's frame; None too where it is not seen.
+        inside_share: share of a scan's points within `ranges`, 0..1.
+        height: of the sensor above the ground; None if it cannot be estimated, which is then among the findings.
+        notes: sentences about how a recording is read: that it was unpacked.
+        findings: sentences about what is odd; those about the model's training name the option that mends it.
+        problems: sentences about scans and parts of the recording that cannot be read.
+    """
+
+    path: str
+    model: str
+    expected: ExpectedInput
+    ranges: Ranges
+    topics: tuple[Topic, ...]
+    topic: str | None
+    fields: tuple[str, ...]
+    frame_ids: tuple[str, ...]
+    times: ScanTimes | None
+    scans: int
+    inspected: int
+    points: Spread | None
+    not_finite: int
+    reflectance_scales: tuple[float, ...]
+    reflectance: Spread | None
+    ground_z_m: Spread | None
+    inside_share: Spread | None
+    height: HeightEstimate | None
+    notes: tuple[str, ...]
+    findings: tuple[str, ...]
+    problems: tuple[str, ...]
+
+
+def inspect_scans(
+    path: str | Path,
+    *,
+    topic: str | None = None,
+    bundle: str | Path | None = None,
+    around: bool = False,
+    reading: ScanSettings = _AS_TRAINED,
+    frames: int = FRAMES,
+    progress: Progress | None = None,
+) -> ScansInspection:
+    """Measure scans and compare them with those that a model was trained on, as a detector would; it is not run.
+
+    Args:
+        path: a recording, a scan file, or a folder of these.
+        topic: of a recording's scans; None: the only one.
+        bundle: of the model; None: the one that ships.
+        around: the model is to look in every direction.
+        reading: how the files are read and the sensor was mounted.
+        frames: measure so many scans, evenly spaced; of a recording the times of all are read.
+        progress: called after each scan.
+
+    Raises:
+        ScanError: there are no scans, or none can be read.
+        AscaError: the bundle or an option cannot be used.
+    """
+    path, manifest = Path(path), load_bundle(find_bundle(bundle))
+    model = widened(manifest) if around else manifest
+    ranges, expected = model.spec.ranges, model.expected_input
+    if around:
+        ranges = ranges_around(ranges, len(turns_around(ranges, camera_view=expected.camera_view)))
+    source = _open_recording(path, topic, reading, frames) if is_recording(path) else _open_files(path, reading, frames)
+    if topic is not None and source.recorded is None:
+        raise ConfigError(f"--topic {topic}: is for recordings (.mcap, .db3, .bag, .pcap); leave it out")
+    mounting, height, doubt = _mounting(reading, source.samples)
+    measured = _Measured(mounting, expected, ranges)
+    times: list[tuple[int, int]] = []
+    frame_ids: dict[str, None] = {}
+    fields: tuple[str, ...] = ()
+    troubles: list[str] = []
+    for one in Reporter(progress).track(source.scans, "Inspecting", source.to_read):
+        if one.scan is None:
+            troubles.append(str(one.trouble))
+            continue
+        times.append((one.number, one.time_ns))
+        frame_ids[one.frame_id] = None
+        fields = fields or one.fields
+        if one.number % source.step == 0:
+            measured.add(source.name(one.number), one.scan)
+    recorded = source.recorded
+    damage = recorded.recording.damage if recorded else None
+    if not times:
+        of_topic = f" of {recorded.topic.name}" if recorded else ""
+        why = f": {reason}" if (reason := next(iter(troubles), damage)) else ""
+        raise ScanError(f"{path}: none of the {source.to_read} scans{of_topic} can be read{why}")
+    found = [*source.said, *([doubt] if doubt else []), *repairs_of(measured.notes)]
+    if recorded:
+        found += _odd_times(times)
+    if len(frame_ids) > 1:
+        found.append(f"the scans are in {len(frame_ids)} frames: {', '.join(frame_ids)[:200]}")
+    problems = [f"{_count(len(troubles), 'scan')} cannot be read: {troubles[0]}"] if troubles else []
+    return ScansInspection(
+        path=str(path),
+        model=model.name,
+        expected=expected,
+        ranges=ranges,
+        topics=tuple(recorded.recording.topics) if recorded else (),
+        topic=recorded.topic.name if recorded else None,
+        fields=fields,
+        frame_ids=tuple(filter(None, frame_ids)),
+        times=_scan_times(times) if recorded else None,
+        scans=len(times) + len(troubles) if recorded else source.total,
+        inspected=len(measured.points),
+        points=spread(np.array(measured.points)),
+        not_finite=sum(notes.dropped_points for _, notes, _ in measured.notes),
+        reflectance_scales=tuple(
+            sorted({notes.reflectance_scale for _, notes, _ in measured.notes if notes.reflectance_scale is not None})
+        ),
+        reflectance=spread(np.array(measured.reflectance)),
+        ground_z_m=spread(np.array(measured.ground_z_m)),
+        inside_share=spread(np.array(measured.inside)),
+        height=height,
+        notes=recorded.recording.notes if recorded else (),
+        findings=tuple(found),
+        problems=(*([damage] if damage else []), *problems),
+    )
+
+
+class _Source(NamedTuple):
+    """Scans to inspect.
+
+    Of a recording all scans are read, and those measured whose number `step` divides; of `total` files every `step`-th
+    is read. `said` are sentences about how.
+    """
+
+    scans: Iterator[RecordedScan]
+    total: int
+    to_read: int
+    step: int
+    samples: Iterable[NamedPoints]
+    said: Sequence[str]
+    name: Callable[[int], str]
+    recorded: RecordedScans | None = None
+
+
+def _open_recording(path: Path, topic: str | None, reading: ScanSettings, frames: int) -> _Source:
+    if reading.columns is not None:
+        raise ConfigError(f"--columns {reading.columns}: is for .bin files, and a recording names its fields")
+    require("recordings")
+    recording = open_recording(path)
+    scans = RecordedScans(recording, recording.point_cloud_topic(topic), reading.reflectance_scale)
+    total, said = scans.topic.messages, said_of_scale(scans.scale)
+    step = max(math.ceil(total / frames), 1)
+    return _Source(scans.read(), total, total, step, scans.samples(), said, "scan {}".format, scans)
+
+
+def _open_files(path: Path, reading: ScanSettings, frames: int) -> _Source:
+    paths = [scan.path for scan in name_scans([path])]
+    files = ScanInput(replace(reading, sensor_height=None), paths)  # the height is estimated below in any case
+    step = math.ceil(len(paths) / frames)
+    chosen = range(0, len(paths), step)
+    return _Source(
+        scans=_read_files(paths, chosen, files),
+        total=len(paths),
+        to_read=len(chosen),
+        step=step,
+        samples=sample_points(paths, lambda one: files.read(one).points),
+        said=files.said,
+        name=lambda number: paths[number].name,
+    )
+
+
+def _read_files(paths: Sequence[Path], numbers: Iterable[int], scan_input: ScanInput) -> Iterator[RecordedScan]:
+    for number in numbers:
+        try:
+            yield RecordedScan(number, 0, "", scan_input.read(paths[number]))
+        except ScanError as error:
+            yield RecordedScan(number, 0, "", None, str(error))
+
+
+def _mounting(
+    reading: ScanSettings, samples: Iterable[NamedPoints]
+) -> tuple[Mounting, HeightEstimate | None, str | None]:
+    """The mounting as `reading` says, and the height that the scans show, or why they show none."""
+    try:
+        mounting, height = replace(reading, sensor_height="auto").mounting(samples)
+    except ScanError as error:
+        if reading.sensor_height == "auto":
+            raise
+        return reading.stated_mounting(), None, str(error)
+    return mounting if reading.sensor_height == "auto" else reading.stated_mounting(), height, None
+
+
+class _Measured:
+    """Measurements of scan after scan; each list but `notes` leaves out the scans that do not have it."""
+
+    def __init__(self, mounting: Mounting, expected: ExpectedInput, ranges: Ranges) -> None:
+        self._mounting, self._expected, self._ranges = mounting, expected, ranges
+        self._to_model: FrameChange = mounting.to_model(expected.sensor_height_m)
+        self.points: list[int] = []
+        self.reflectance: list[float] = []
+        self.ground_z_m: list[float] = []
+        self.inside: list[float] = []
+        self.notes: list[tuple[str, ScanNotes, tuple[str, ...]]] = []
+
+    def add(self, name: str, scan: Scan) -> None:
+        """Measure one more scan."""
+        points = usable_points(scan.points, self._to_model).unclipped
+        inside = _count_inside(points, self._ranges)
+        counts = ScanCounts(len(points), len(points) - inside, 0)
+        warnings = check_input(points, counts, self._expected, self._mounting, self._ranges)
+        self.notes.append((name, scan.notes, tuple(warning.text for warning in warnings)))
+        self.points.append(len(points))
+        if not len(points):
+            return
+        self.reflectance.append(float(points[:, 3].mean(dtype=np.float64)))
+        self.inside.append(inside / len(points))
+        if (ground := ground_z_m(points)) is not None:
+            self.ground_z_m.append(ground)
+
+
+def _count_inside(points: NDArray[np.float32], ranges: Ranges) -> int:
+    inside = np.ones(len(points), bool)
+    for axis, (low, high) in enumerate(ranges):
+        inside &= (points[:, axis] >= low) & (points[:, axis] < high)
+    return int(np.count_nonzero(inside))
+
+
+def _scan_times(times: Sequence[tuple[int, int]]) -> ScanTimes:
+    """Of the numbers and time stamps, nanoseconds, of scans in the order of the recording."""
+    numbers, stamps = (np.array(column, np.int64) for column in zip(*times, strict=True))
+    steps = np.diff(stamps) / 1e9
+    seconds = float(stamps.max() - stamps.min()) / 1e9
+    if not (steps > 0).any():
+        return ScanTimes(seconds, None, 0, 0, 0.0, int(numbers[0]))
+    usual_s = float(np.median(steps[steps > 0]))
+    gaps = steps[steps > GAP * usual_s]
+    longest = int(steps.argmax())
+    missing = int((np.round(gaps / usual_s) - 1).clip(min=1).sum())
+    return ScanTimes(seconds, 1 / usual_s, len(gaps), missing, float(steps[longest]), int(numbers[longest]))
+
+
+def _odd_times(times: Sequence[tuple[int, int]]) -> list[str]:
+    """Sentences about stamps that go back or jump, and about gaps."""
+    said = [said] if (said := said_of_stamps([stamp for _, stamp in times])) else []
+    found = _scan_times(times)
+    if found.gaps:
+        said.append(
+            f"{_count(found.gaps, 'gap')} in the time stamps, the longest of {found.longest_gap_s:.3g} s after scan "
+            f"{found.longest_gap_after}: at the usual rate {_count(found.missing, 'scan')} more would be there"
+        )
+    return said
+
+
+def _count(number: int, what: str) -> str:
+    return f"{number} {what}{'s' * (number != 1)}"
