@@ -3,8 +3,8 @@
 Features are rows, one for each active cell; a rulebook's entry beyond the last row stands for zeros. Every sum stays
 inside a matrix product or runs in a fixed order, so results do not differ from run to run.
 
-In a lower precision a CPU's product is compiled by oneDNN for each shape that it has not seen: milliseconds, again and
-again where every batch has its own number of rows; a third of a training step. Rows of zeros round it to one of few.
+In a lower precision, oneDNN compiles a CPU's product for each new shape, in milliseconds: a third of a training step
+where every batch has another number of rows. Rows are therefore padded with zeros to one of few numbers.
 """
 
 from collections.abc import Callable, Iterator

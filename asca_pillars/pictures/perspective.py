@@ -63,7 +63,7 @@ class ChaseCamera:
     def project(self, places_m: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Project (..., 3) x, y, z in metres to pixels (..., 2), column and row, and depths (...,) in metres.
 
-        Pixels of what is nearer than half a metre, or behind, mean nothing.
+        Pixels of points nearer than half a metre, or behind the camera, are meaningless.
         """
         seen = (np.asarray(places_m, np.float64) - self.eye_m) @ self._axes().T
         depth = seen[..., 2]
@@ -188,7 +188,7 @@ def _draw_rings(canvas: Image, camera: ChaseCamera, ground_m: float, reach_m: fl
 
 
 def _draw_ego(texts: Texts, camera: ChaseCamera, ground_m: float) -> None:
-    """The sensor as an arrow, which no text is to cover."""
+    """Draw the sensor as an arrow, which no text covers."""
     pixels, depth = camera.project(np.column_stack([_EGO_M, np.full(len(_EGO_M), ground_m + 0.05)]))
     if (depth > _NEAR_M).all():
         cv2.fillPoly(texts.canvas, [subpixels(pixels)], _WHITE, cv2.LINE_AA, SUBPIXEL_BITS)

@@ -168,7 +168,7 @@ def draw_on_image(
 ) -> Image:
     """Draw LiDAR boxes (N, 7) on a copy of a camera image (H, W, 3) as wireframes with tinted front faces.
 
-    `scores` is None for ground truth, `colors` for those of the classes. What lies behind the camera is cut off.
+    `scores` is None for ground truth, `colors` for those of the classes. Lines behind the camera are cut off.
     """
     colors = [class_color(name) for name in names] if colors is None else colors
     canvas = image.copy()

@@ -74,8 +74,8 @@ class Collate:
 class LabeledDataset(Dataset[Sample | AscaError]):
     """Frames as samples for one family of detectors.
 
-    What a sample holds does not depend on the number of workers or on what was drawn before it: a resumed run sees what
-    an unbroken one would have seen. An index is therefore a pair (epoch, frame number), see `EpochSampler`.
+    A sample does not depend on the number of workers or on samples before it, so that a resumed run gets the same as an
+    uninterrupted one. An index is therefore a pair (epoch, frame number), see `EpochSampler`.
 
     Args:
         frames: read and augmented.

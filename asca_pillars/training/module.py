@@ -162,7 +162,7 @@ def steps_per_epoch(recipe: TrainConfig, frames: int, processes: int) -> int:
 def has_bfloat16(device: str | None = None) -> bool:
     """Return whether a device multiplies in bfloat16 itself. None is Lightning's choice: a GPU if there is one.
 
-    One that does not still computes it, number by number: twenty times slower than float32 on a CPU with AVX2 alone.
+    Others emulate it: twenty times slower than float32 on a CPU with AVX2 alone.
     """
     if device != "cpu" and torch.cuda.is_available():
         return torch.cuda.is_bf16_supported(including_emulation=False)

@@ -70,8 +70,7 @@ def claim(out: Path, config: Config, seen: Seen, steps: int = 0) -> None:
     """Write what this run is into `out`, or make sure that the run found there is the same one.
 
     A run may be made longer where its steps so far are those of the longer run: always with the `step` schedule, and
-    with `warmup_stable_decay` until its rate falls. One without any checkpoint has learnt nothing, so that another
-    takes its place.
+    with `warmup_stable_decay` until its rate falls. A run without any checkpoint may be replaced.
 
     Args:
         out: folder of the run.

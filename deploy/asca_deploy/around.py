@@ -5,11 +5,11 @@ A sparse neck's graphs hold no ranges, so that a bundle trained on whole revolut
 
     pass 0: ahead     pass 1: left     pass 2: behind     pass 3: right
 
-The scan turns about the normal of its ground. A sensor that is pitched by half a degree sees the road ahead rise, as
-the model did in its training; turned about the sensor's own axis, the road behind would sink, and less would be found.
+The scan turns about the normal of its ground. With a sensor pitched by half a degree the road ahead rises, as in the
+training data; turned about the sensor's axis, the road behind would sink, and fewer objects would be found.
 
-Neighbouring passes both see what stands between them. Of boxes of a class that overlap, the one stays that its pass
-sees nearest to straight ahead, where the model has seen the most in training.
+Objects between two sectors are found by both passes. Of overlapping boxes of a class, that one is kept which is nearest
+to straight ahead in its pass, where the model had the most training data.
 """
 
 import math
@@ -41,8 +41,8 @@ _STEP_RAD = math.radians(1)
 def widened(bundle: Bundle) -> Bundle:
     """Return the bundle with ranges widened in every direction to its farthest reach, where its graphs allow it.
 
-    They do with a sparse neck, which reads rulebooks instead of a map, on even pillars, if the weights were trained on
-    whole revolutions. Other bundles are returned as they are. `max_pillars` grows with the area.
+    That requires a sparse neck, which reads rulebooks instead of a map, pillars of one size, and weights trained on
+    whole revolutions. Other bundles are returned unchanged. `max_pillars` grows with the area.
     """
     if not isinstance(bundle, PillarBundle) or bundle.pillar.neck == "dense" or bundle.expected_input.camera_view:
         return bundle

@@ -119,7 +119,7 @@ def disagreement(expected: Detections, found: Detections, spec: DetectorSpec) ->
     """Return the first box of either side without a partner on the other; None if every box has one.
 
     Partners have the same class and are as near as the limits above demand. A box whose score ties with its class's
-    threshold needs none. Where there is no box above that, nothing is proven and nothing agrees.
+    threshold needs none. Without any box above its threshold, nothing agrees.
     """
     if not (~_ties(expected, spec)).any():
         return "unproven, the sample scan shows no clear object with this model"

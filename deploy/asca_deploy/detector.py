@@ -68,9 +68,9 @@ class _Frame(NamedTuple):
 class Detector:
     """A detector of any kind that ships or was exported, without PyTorch.
 
-    One object may be called from several threads at once and gives each the boxes that it would get alone: nothing
-    of a scan is kept in it. That costs a pseudo-image per thread (`PillarPipeline`) and no lock; the calls share the
-    network's threads, so several callers get more scans per second only where one leaves cores idle.
+    A detector is thread-safe: it keeps no state of a scan, and each call returns the same boxes as alone. Each calling
+    thread needs a pseudo-image of its own (`PillarPipeline`) and no lock; calls share the network's threads, so several
+    callers get more scans per second only where one leaves cores idle.
 
     Args:
         bundle: folder written by `asca export`, or name of one that ships (`shipped_bundles`); None for the
@@ -152,8 +152,8 @@ class Detector:
     def warm_up(self, points: int = 100_000, scans: int = 2) -> float:
         """Detect in made-up scans, so that the first real one takes no longer than the others.
 
-        Compiles what is not compiled yet, and lets the runtime allocate for scans of this size. Nothing of it is
-        logged or warned of.
+        Compiles kernels that are not compiled yet, and lets the runtime allocate memory for scans of this size. Logs
+        and warns of nothing.
 
         Args:
             points: of each scan.

@@ -1,7 +1,7 @@
 """The part of bundle.json that follows from `spec`, written out for readers without our geometry code.
 
-The runtime derives these values itself; a bundle whose written ones differ was edited by hand or made by a
-version whose features or anchors meant something else, and is refused.
+The runtime derives these values itself; a bundle with other written values was edited by hand or made by a version with
+other features or anchors, and is refused.
 """
 
 from typing import Any

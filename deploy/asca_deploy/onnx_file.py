@@ -1,7 +1,7 @@
 """Checks of an ONNX file before a backend opens it, read without the package `onnx`.
 
-The file is a protobuf message (https://github.com/onnx/onnx/blob/main/onnx/onnx.proto); only the few fields below
-are looked at, everything else is stepped over.
+The file is a protobuf message (https://github.com/onnx/onnx/blob/main/onnx/onnx.proto); only the few fields below are
+read, others are skipped.
 """
 
 from collections.abc import Iterator

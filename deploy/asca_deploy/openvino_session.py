@@ -138,7 +138,7 @@ def _core() -> "openvino.Core":
 def _import_openvino() -> Any:
     """Import the package without its report to the manufacturer.
 
-    It sends one at every import, unless the package that does so cannot be imported; a vehicle must not report.
+    It sends one at every import unless its telemetry package cannot be imported.
     """
     telemetry = "openvino_telemetry"
     absent = telemetry not in sys.modules

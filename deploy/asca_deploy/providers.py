@@ -9,7 +9,7 @@
 faster: bfloat16 in OpenVINO, TF32 in CUDA, float16 in TensorRT. In an int8 bundle both concern only what the export
 left in floating point.
 
-A provider that was asked for and cannot run is an error, never a silent fallback to the CPU.
+A requested provider that cannot run is an error; there is no silent fallback to the CPU.
 """
 
 from pathlib import Path

@@ -1,9 +1,9 @@
 """Multi-object tracking: constant velocity, one-to-one matching, births and deaths by score.
 
 Each track is a Kalman filter over position and velocity on the ground, with white acceleration (Bar-Shalom, Li,
-Kirubarajan, Estimation with Applications to Tracking and Navigation, 6.3); x and y share one covariance, for neither
-motion nor measurement prefers an axis. How sure a track is of its existence is a score that detections raise and time
-lowers (Benbarka et al., Score refinement for confidence-based 3D multi-object tracking, IROS 2021).
+Kirubarajan, Estimation with Applications to Tracking and Navigation, 6.3); x and y share one covariance, as motion and
+measurement are isotropic. The confidence of a track is a score that detections raise and time lowers (Benbarka et al.,
+Score refinement for confidence-based 3D multi-object tracking, IROS 2021).
 """
 
 from collections.abc import Mapping

@@ -167,8 +167,7 @@ def compare_boxes(
     """Decode both maps and pair the boxes, before and after suppression; every box needs a partner.
 
     Thresholds are lowered until the best COMPARED_ANCHORS of each class take part, and all boxes are kept. Before
-    suppression nothing but the thresholds can excuse a difference; after it, which of two overlapping boxes of equal
-    score survives can.
+    suppression only thresholds can explain a difference; after it, ties between overlapping boxes of equal score can.
 
     Args:
         expected, found: maps, or rows of the same head cells.

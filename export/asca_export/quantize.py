@@ -1,8 +1,7 @@
 """Quantization of the backbone to 8 bits: per-channel steps of activations, jointly rounded weights.
 
-Most of a pseudo-image is empty, and there a trained network gives the same small values everywhere. If those are
-rounded, one and the same error stands all over the map and grows from layer to layer; nothing else costs as much
-precision. So
+Most of a pseudo-image is empty, where a trained network has the same small values everywhere. Rounding them makes the
+same error all over the map, which grows from layer to layer and costs more precision than anything else. Therefore:
 
 - a channel's step is its largest value on the calibration scans / 255, then stretched until its value in empty space is
   a whole number of steps. Steps of single channels are free: between a ReLU and the next layer a positive factor moves
@@ -11,7 +10,7 @@ precision. So
   scans (GPTQ, arXiv 2210.17323); the bias makes up for what remains in empty space.
 
 Weights are signed 7-bit per output channel. Seven, because CPUs without VNNI add pairs of products u8 x s8 in 16 bits:
-2 x 255 x 64 fits, 2 x 255 x 127 does not, and they would saturate without a word.
+2 x 255 x 64 fits, 2 x 255 x 127 does not, and they would saturate silently.
 """
 
 from collections.abc import Collection, Iterable, Iterator

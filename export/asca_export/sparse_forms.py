@@ -189,8 +189,8 @@ def sparse_multiply_accumulates(backbone: SparseBackbone, tables: NeckRulebooks[
 def _joined(graph: RowGraph, maps: Sequence[str], places: Sequence[str], missing: NDArray[np.generic]) -> str:
     """Return rows of several maps, picked by places (H,) of each, side by side: (H, maps * channels).
 
-    By one gather from all maps, one after the other with the row `missing` (1, channels) behind each: with one from
-    each of them, what they give would have to be copied once more, row by row, to stand side by side.
+    Uses one gather from all maps, concatenated with the row `missing` (1, channels) behind each: the results of one
+    gather per map would have to be copied again to stand side by side.
     """
     rows, indices, first = [], [], ""
     for number, (values, place) in enumerate(zip(maps, places, strict=True)):

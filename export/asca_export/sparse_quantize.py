@@ -1,8 +1,8 @@
 """The sparse backbone in 8 bits, as `quantize` does it for the dense one; here no empty space has to be rounded.
 
 A channel's step is its largest value on the calibration scans / 255. Weights are rounded together (GPTQ), and the bias
-makes up for what rounding changes in the mean. The head's are rounded for the cells that boxes come from: what it says
-of the many others is hardly read.
+makes up for what rounding changes in the mean. The head's weights are rounded for the cells with the highest scores,
+which boxes are decoded from.
 """
 
 import copy

@@ -1,8 +1,8 @@
 """Feature encoding network: points of pillars -> one feature vector per pillar (section 3.2 of the paper).
 
-Correlative point attention (CPA, eq. 6-11) is here in the readings that the paper's text allows. Letters: P pillars of
-one frame, M points, C channels, d attention width, N points of one pillar at most. Each reading ends with the residual
-connection of eq. (11), and so does the control without attention.
+Correlative point attention (CPA, eq. 6-11) is implemented in the variants that the paper's text allows. Letters: P
+pillars of one frame, M points, C channels, d attention width, N points of one pillar at most. Each variant ends with
+the residual connection of eq. (11), and so does the control without attention.
 """
 
 from abc import ABC, abstractmethod
@@ -78,8 +78,8 @@ class _ChannelMixing(nn.Module, ABC):
 class ChannelLinear(_ChannelMixing):
     """Control without attention: a learned C x C mixing matrix that is the same for every frame.
 
-    It separates the effect of attention from that of one more linear layer. Training starts at the identity, near
-    which channel attention starts, too.
+    It separates the effect of attention from that of one more linear layer. Training starts at the identity, near the
+    start of channel attention.
     """
 
     def __init__(self, channels: int) -> None:

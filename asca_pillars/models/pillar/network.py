@@ -98,7 +98,7 @@ class PillarDetector(Trainable):
     def predict(self, batch: LabeledPillars) -> PillarOutputs:
         """Return head maps (B, channels, H, W) of logits and residuals of B labelled frames, and their cells.
 
-        Where some normalization would see a single point or cell, those of the training so far are used instead.
+        Where a normalization would see a single point or cell, its running statistics are used.
         """
         pillars, neck = batch.pillars, batch.pillars.neck
         rows = [len(pillars.features)]
@@ -110,7 +110,7 @@ class PillarDetector(Trainable):
     def loss(self, outputs: PillarOutputs, batch: LabeledPillars) -> Mapping[str, Tensor]:
         """Return the terms of eq. (15) by name, unitless, from head maps (B, channels, H, W), see `detection_loss`.
 
-        Anchors at inactive head cells take no part.
+        Anchors at inactive head cells are left out.
         """
         neck, targets = outputs.neck, batch.targets
         seen = targets if neck is None else targets_at(targets, neck.head_cells)

@@ -30,8 +30,8 @@ class SetAbstraction(nn.Module):
     """MLP(3 + C -> widths) on [p_j - q ; f_j] for the points j of the ball around q, then the maximum.
 
     The first layer is linear, so W [p_j - q ; f_j] = W [p_j ; f_j] - W [q ; 0]: once for each point and once for each
-    query instead of once for each pair, exact but for rounding. It must stay in float32, because p_j and q are large
-    and their difference is small.
+    query instead of once for each pair, exact up to rounding. It must stay in float32, because p_j and q are large and
+    their difference is small.
 
     Args:
         in_channels: C, features of a point; may be 0.

@@ -1,6 +1,6 @@
 """Compiled loops of `pillarize`; tests/ops/numpy_kernels.py has them in NumPy.
 
-Indices are unsigned where it matters: with others, numba looks for negative ones, which count from the end.
+Indices are unsigned where it matters: for signed ones, numba checks for negative values, which count from the end.
 """
 
 from typing import Any

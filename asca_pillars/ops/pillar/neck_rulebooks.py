@@ -3,7 +3,7 @@
 The neck is that of Table 1 (three blocks that halve the map, three upsamplings to the head's resolution), computed at
 active cells alone. Which cells are active is a rule:
 
-- `sub`: strided convolutions reach every output that sees an active input, all others stay where their input is;
+- `sub`: strided convolutions are regular (every output with an active input), all others are submanifold;
 - `fine`: as `sub`, and the first stride-1 convolution of the finest block also writes to the eight neighbors of its
   active cells. The coarser levels follow from the cells before that growth.
 

@@ -1,7 +1,7 @@
 """Pillarization: the network's input from points (paper section 3.2), for training, export and runtime.
 
-Pillars are flat: the kept points of all pillars stand one after another, and `pillar_index` holds the pillar of each
-is. Nothing is padded, so nothing needs to be masked later.
+Pillars are flat: the kept points of all pillars follow one another, and `pillar_index` holds the pillar of each point.
+There is no padding, and no masking later.
 """
 
 import reprlib

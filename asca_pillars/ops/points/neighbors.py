@@ -25,7 +25,7 @@ _ROUNDING = 1e-3  # of a column: how far float32 may misplace a point that stand
 def ball_query(points: NDArray[Any], queries: NDArray[Any], radius_m: float, samples: int) -> NDArray[np.int32]:
     """Return up to `samples` indices of points within the radius of each query: (N, 3), (Q, 3) -> (Q, samples).
 
-    A ball of fewer points has them as they are stored, then its first one again and again; one without any has N.
+    A ball of fewer points holds them in the order of storage, then repeats its first one; an empty ball holds N.
 
     The columns of a full ball are visited in a pseudo-random order that depends on their number alone, the points of a
     column as they are stored, and the first `samples` found are taken: at first no more than an eighth of them from one
@@ -99,8 +99,8 @@ def nearest_in_cubes(
 ) -> NDArray[np.int32]:
     """Return three nearest points of each cell of a cube around each query: (N, 3), (Q, 3) -> (Q, cells^3, 3) indices.
 
-    Points count that are less than twice the half length away from the query along every axis (VectorPool; AV PV-RCNN,
-    eq. 12 and 13). Nearest first, of equally near ones the earlier; with fewer than three points the rest is index N.
+    Only points within twice the half length of the query along every axis count (VectorPool; AV PV-RCNN, eq. 12 and
+    13). Nearest first, of equally near ones the earlier; with fewer than three points the rest is index N.
 
     Args:
         points: (N, >=3) finite x, y, z in metres; N may be 0.
@@ -149,8 +149,8 @@ def point_scales(
 ) -> tuple[PointScale[NDArray[Any]], ...]:
     """Return a scale for each radius, the finest first: all keypoints, the first quarter of them, the first sixteenth.
 
-    Keypoints are farthest points in the order in which they were taken, so that the first of them are what sampling
-    the keypoints again would take.
+    Keypoints are in the order of farthest-point sampling, so that the first of them are those that sampling the
+    keypoints again would give.
 
     Args:
         points: (N, >=3) finite, metres, LiDAR frame.

@@ -71,9 +71,9 @@ _COLUMN_M = 1.5  # 1 to 3 m take about as long
 def farthest_points(points: NDArray[Any], count: int) -> NDArray[np.int32]:
     """Return indices of points by farthest-point sampling, in the order in which they are taken.
 
-    The first point, then again and again the one whose nearest taken point is farthest, by squared distance in
-    float32; of equally far ones the earlier. Points are kept in columns, of which only those are looked into that a
-    new sample can change.
+    Sampling starts with the first point, then repeatedly takes the one farthest from its nearest sample, by squared
+    distance in float32; of equally far ones the earlier. Points are sorted into columns, of which only those that a new
+    sample can change are visited.
 
     Args:
         points: (N, >=3) finite x, y, z in metres; N may be 0.
@@ -93,7 +93,7 @@ def points_near_boxes(
 ) -> NDArray[np.float32]:
     """Return the points within `margin_m` of the circles around boxes seen from above: (N, 4), (R, 7) -> (M, 4).
 
-    Keypoints are worth more where proposals are (PV-RCNN++, arXiv 2102.00463, section 4.1).
+    Proposal-centric sampling of keypoints (PV-RCNN++, arXiv 2102.00463, section 4.1).
     """
     points = np.ascontiguousarray(points, np.float32)
     centers = boxes[:, :2].astype(np.float32)

@@ -135,10 +135,10 @@ def _farthest_points(
 ) -> int:
     """Choose sample after sample, each the farthest from those before it.
 
-    `sorted_points`: x, y, z and squared distance to the nearest sample, in `order`. Of each column, `boxes`: what
-    bounds its points, low and high; `largest`: of their distances, and `best`: where.
+    `sorted_points`: x, y, z and squared distance to the nearest sample, in `order`. For each column, `boxes`: bounds of
+    its points, low and high; `largest`: of their distances, and `best`: its index.
 
-    A column is looked into only if its box is nearer to the new sample than the largest distance in it; rounding keeps
+    A column is visited only if its box is nearer to the new sample than the largest distance in it; rounding keeps
     distances in order, so none is missed.
     """
     xs, ys, zs, nearest = sorted_points[0], sorted_points[1], sorted_points[2], sorted_points[3]

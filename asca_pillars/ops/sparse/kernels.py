@@ -1,7 +1,7 @@
 """Compiled loops of `CellMap`; tests/ops/numpy_kernels.py has them in NumPy.
 
 Masks stay uint64 throughout, because numba turns a sum of uint64 and int64 into a float; indices are unsigned where it
-matters, because with others it looks for negative ones, which count from the end.
+matters, because for signed ones it checks for negative values, which count from the end.
 """
 
 from typing import Any

@@ -1,8 +1,9 @@
 """Rulebooks of sparse convolutions: geometry of a convolution, active cells of a lattice, links between lattices.
 
-A lattice is made of columns: along z a cell is one bit of its column's 64-bit mask, so that a cell's row is the row
-at which its column starts plus the number of bits set below it. No hash, no sort. Active cells are ordered by
-(y, x, z), z running fastest, which makes every rulebook and every network output independent of threads and machine.
+A lattice is made of columns: along z a cell is one bit of its column's 64-bit mask, so that a cell's row is the row at
+which its column starts plus the number of bits set below it. This needs neither hashing nor sorting. Active cells are
+ordered by (y, x, z), z running fastest, which makes every rulebook and every network output independent of threads and
+machine.
 """
 
 import math
@@ -167,8 +168,8 @@ class CellMap:
     def table(self, source: "CellMap", links: Links) -> NDArray[np.int32]:
         """Return the row in `source` that each tap joins with each active cell: (N, K), len(source) for none.
 
-        With `Convolution.inputs` it is what the convolution from `source` to this map reads. With `outputs` it is
-        the inverse that its backward pass reads: which output, of the map `source`, each input was read by.
+        With `Convolution.inputs` it is the rulebook of the convolution from `source` to this map. With `outputs` it is
+        the inverse for the backward pass: the output, on the map `source`, that read each input.
         """
         table = np.empty((len(self.cells), math.prod(axis.shape[1] for axis in links)), np.int32)
         self._kernels.fill_table(self.cells, *links, source.shape[2], *source.columns, len(source), table)
@@ -177,8 +178,8 @@ class CellMap:
     def places(self, parents: "CellMap", halvings: int) -> NDArray[np.int32]:
         """Return the row of each active cell of this map among the outputs of a non-overlapping upsampling.
 
-        Seen from above (one cell along z). Each parent cell has s^2 outputs, s = 2^halvings, its row of them before
-        the next parent's, (y, x) within the parent: (N,) int32, len(parents) * s^2 where the parent is not active.
+        For lattices one cell high. Each parent cell has s^2 outputs, s = 2^halvings, its row of them before the next
+        parent's, (y, x) within the parent: (N,) int32, len(parents) * s^2 where the parent is not active.
         """
         missing = len(parents) << (2 * halvings)
         places = np.empty(len(self.cells), np.int32)
@@ -216,7 +217,7 @@ def join(convolution: Convolution, source: CellMap, target: CellMap) -> Join:
 def stack_rows(tables: Sequence[NDArray[np.int32]], rows: Sequence[int]) -> NDArray[np.int32]:
     """Stack tables (M_i, ...) of indices into features of `rows[i]` rows -> one into all of them, (sum of M_i, ...).
 
-    What is missing, row rows[i], becomes row sum(rows).
+    The index of a missing row, rows[i], becomes sum(rows).
     """
     starts, total = np.concatenate([[0], np.cumsum(rows)]).astype(np.int32), sum(rows)
     moved = [

@@ -55,7 +55,7 @@ def encode_refinement(boxes: NDArray[np.floating[Any]], proposals: NDArray[np.fl
     """Encode boxes[k] as residuals to proposals[k], metres and radians: (R, 7), (R, 7) -> (R, 7) float32.
 
     As an anchor's (`encode_boxes`), the proposal moved to the origin being the anchor; the heading difference lies in
-    [-pi/2, pi/2), because refinement leaves it to the proposal which end is the front.
+    [-pi/2, pi/2), because the direction of the heading is the proposal's.
     """
     frames = proposals.astype(np.float64)
     seen = boxes_in_frames(boxes.astype(np.float64), frames)

@@ -9,8 +9,8 @@ STATUS = Path("/proc/self/status")
 def peak_memory_mib() -> float | None:
     """Return the largest resident memory of the process so far; None if the system does not report it.
 
-    Linux keeps the figure of getrusage across exec, so that a small program started by a large one looks large;
-    its own /proc does not.
+    Linux keeps the figure of getrusage across exec, which is too large for a small program started by a large one;
+    /proc is correct.
     """
     if (peak := _status_mib("VmHWM")) is not None:
         return peak

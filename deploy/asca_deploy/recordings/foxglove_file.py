@@ -1,6 +1,6 @@
 """Boxes as an MCAP that Foxglove shows: `foxglove.SceneUpdate` in JSON, one message for each scan.
 
-Foxglove knows the schema by its name (docs.foxglove.dev, Message schemas); what stands here is the part that is used.
+Foxglove identifies the schema by its name (docs.foxglove.dev, Message schemas); the part that is used is defined here.
 Each message deletes the boxes of the scan before and adds its own, so that jumping in time shows one scan's boxes.
 Opened beside the recording, they lie in its 3D panel: frame and times are those of the scans.
 """
