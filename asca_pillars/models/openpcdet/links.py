@@ -86,7 +86,7 @@ _HEADS = {"scores": "conv_cls", "boxes": "conv_box", "directions": "conv_dir_cls
 
 
 def map_links(block_convs: Sequence[int], first: Callable[[Tensor], Tensor] = as_it_is) -> Iterator[Link]:
-    """Return the links of `backbone_2d` and `dense_head`.
+    """Yield the links of `backbone_2d` and `dense_head`.
 
     Args:
         block_convs: convolutions of each block after its first.

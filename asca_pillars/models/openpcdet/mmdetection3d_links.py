@@ -58,7 +58,7 @@ _NAMES: tuple[tuple[str, _Name], ...] = (
 def mmdetection3d_links(
     model: PillarModel | PvRcnnModel, state: Mapping[str, Tensor], wanted: Mapping[str, Tensor], *, legacy: bool = True
 ) -> Iterator[Link]:
-    """Return the links for our network of this model.
+    """Yield the links for our network of this model.
 
     Args:
         model: ours.

@@ -19,7 +19,7 @@ _JOINED = ("points", *LEVEL_SOURCES)  # after the map
 
 
 def pv_rcnn_links(model: PvRcnnModel, state: Mapping[str, Tensor], wanted: Mapping[str, Tensor]) -> Iterator[Link]:
-    """Return the links for `build_pv_rcnn(model)` without extensions by later papers.
+    """Yield the links for `build_pv_rcnn(model)` without extensions by later papers.
 
     Args:
         model: ours.

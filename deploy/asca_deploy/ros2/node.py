@@ -282,7 +282,7 @@ class _Node:
 
 @contextmanager
 def _stop_signals() -> Iterator[threading.Event]:
-    """Return an event that SIGINT and SIGTERM set; a second signal ends the process as usual."""
+    """Yield an event that SIGINT and SIGTERM set; a second signal ends the process as usual."""
     stop = threading.Event()
     kinds = signal.SIGINT, signal.SIGTERM
     before = {kind: signal.getsignal(kind) for kind in kinds}
