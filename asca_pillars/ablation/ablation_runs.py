@@ -34,22 +34,22 @@ class Run:
 
     @property
     def checkpoint(self) -> Path:
-        """The last one that training wrote."""
+        """Last checkpoint of the training."""
         return self.folder / "checkpoints" / "last.ckpt"
 
     @property
     def trained(self) -> Path:
-        """Written when training has ended: how long it took."""
+        """File with the duration of the training, written at its end."""
         return self.folder / "trained.json"
 
     @property
     def evaluated(self) -> Path:
-        """The report of `asca eval`."""
+        """Report of `asca eval`."""
         return self.folder / "evaluation" / "report.json"
 
 
 def runs(out: str | Path, seeds: Sequence[int], variants: Sequence[Row]) -> list[Run]:
-    """Every run, all variants of the first seed before those of the next."""
+    """Return every run, all variants of the first seed before those of the next."""
     return [Run(variant, seed, Path(out) / variant.name / f"seed{seed}") for seed in seeds for variant in variants]
 
 
@@ -105,7 +105,7 @@ def _at_once(todo: Sequence[Run], work: Callable[[Run], None], jobs: int) -> Non
 
 @contextmanager
 def _timed(path: Path) -> Iterator[list[float]]:
-    """The seconds of every attempt, that of this one last once it has ended, well or not; kept in a file.
+    """Time the block: yield the seconds of every attempt, to which its own are appended; kept in a file.
 
     An attempt that was killed together with this process is not among them.
     """

@@ -1,4 +1,4 @@
-"""The ablation's Markdown: what was trained, how, and what came of it, with the spread over the seeds."""
+"""Markdown tables of an ablation: training, results, spread over the seeds."""
 
 import json
 import statistics
@@ -25,7 +25,7 @@ class Speed:
 
 
 def tables(family: Family, results: Mapping[str, Sequence[dict[str, Any]]], speeds: Mapping[str, Speed]) -> str:
-    """Markdown of every table whose variants have results.
+    """Return Markdown of every table whose variants have results.
 
     Args:
         family: of the variants.
@@ -45,7 +45,7 @@ def tables(family: Family, results: Mapping[str, Sequence[dict[str, Any]]], spee
 
 
 def read_results(runs: Iterable[Run]) -> dict[str, list[dict[str, Any]]]:
-    """The evaluations that are there, one per seed, by name of the variant."""
+    """Return the evaluations that are there, one per seed, by name of the variant."""
     results: dict[str, list[dict[str, Any]]] = {}
     for run in runs:
         if run.evaluated.exists():
@@ -86,7 +86,7 @@ def _by_difficulty(family: Family, names: Sequence[str], results: Mapping[str, S
 
 
 def _ap(result: dict[str, Any], class_name: str, difficulty: str) -> float:
-    """3D AP R40 in percent; a class that no detection names has found nothing, which is 0 here."""
+    """Return the 3D AP R40 in percent; 0 for a class without detections."""
     found = result["results"][class_name]
     values = found and found["3d"]
     return float(values["R40"][DIFFICULTIES.index(difficulty)]) if values else 0.0
@@ -102,6 +102,6 @@ def _mean_ap(result: dict[str, Any]) -> float:
 
 
 def _spread(values: Sequence[float]) -> str:
-    """Mean over the seeds, and half the distance between the best and the worst."""
+    """Return the mean over the seeds, and half the distance between the best and the worst."""
     mean = f"{statistics.fmean(values):.2f}"
     return mean if len(values) == 1 else f"{mean} ± {(max(values) - min(values)) / 2:.2f}"

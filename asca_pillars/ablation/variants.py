@@ -13,7 +13,7 @@ from asca_pillars.ops.pv_rcnn.prepare import Deform
 
 
 class Row(Protocol):
-    """A variant: what it changes in the base configuration."""
+    """Interface of a variant: its changes to the base configuration."""
 
     @property
     def name(self) -> str:
@@ -43,7 +43,7 @@ class Family(NamedTuple):
 
 
 _FINE_M = 0.08
-_SIZES = 5  # of a class, the first fields: name, sizes and height, which thresholds do not change
+_SIZES = 5  # first fields of a class: name, sizes and height, which do not depend on thresholds
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ class Variant:
 
     @property
     def overrides(self) -> tuple[str, ...]:
-        """For `asca train -s`. One zone means PointPillars' pillars of 0.16 m, several start at the paper's 0.32 m."""
+        """Overrides for `asca train -s`. One zone has PointPillars' pillars of 0.16 m, several begin with 0.32 m."""
         along_m = _FINE_M if self.fine_pillars else 0.16 if self.zones == 1 else 0.32
         return (
             f"model.spec.grid.map={self.map}",
@@ -98,7 +98,7 @@ class Variant:
         return zones, cpa, insert, neck, matching, self.score_target or "-"
 
     def misfit(self, model: PillarModel) -> str | None:
-        """Rows with other thresholds state all classes."""
+        """Return why the base does not fit: a row with other thresholds states all classes."""
         sizes = [[astuple(one)[:_SIZES] for one in classes] for classes in (KITTI_CLASSES, model.spec.classes)]
         return "states KITTI's classes" if self.person_ious is not None and sizes[0] != sizes[1] else None
 
@@ -230,7 +230,7 @@ class TwoStageVariant:
         )
 
     def misfit(self, model: PvRcnnModel) -> str | None:
-        """Rows with MSAA state all sources, and those without have the balls of raw points."""
+        """Return why the base does not fit: its sources are other than those that the row states."""
         sources = [to_dict(one) for one in model.settings.sources]
         if not sources or sources[0]["source"] != "points":
             return "has balls of raw points, which the base has not"
@@ -239,7 +239,7 @@ class TwoStageVariant:
 
     @property
     def _scales(self) -> tuple[str, ...]:
-        """MSAA takes the place of the balls of raw points."""
+        """Overrides of a row with MSAA, which takes the place of the balls of raw points."""
         return (
             f"model.settings.sources={json.dumps(_SOURCES)}",
             f"model.network.source_widths={json.dumps([[16, 16], [32, 32], [32, 32]])}",

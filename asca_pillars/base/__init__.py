@@ -1,1 +1,1 @@
-"""What every other package builds on: errors, files, processes, settings."""
+"""Base of the other packages: errors, files, processes, settings."""

@@ -1,8 +1,8 @@
-"""How numba compiles the loops of the `*_kernels.py` files and of the simulator.
+"""Compilation with numba of the loops in `*_kernels.py` and in the simulator.
 
 The compiled functions of kernels take memory made by NumPy and have their signatures written out: that takes a quarter
 off the time to compile, and all of it is spent when they are imported, once per machine (numba's cache keeps the
-result). `nogil` lets other threads run meanwhile; nothing is `parallel`, because the network owns the cores.
+result). `nogil` lets other threads run meanwhile; nothing is `parallel`, because the network uses the cores.
 
 numba loads what lies in its cache as it is, machine code as well: an empty file ends the process with an EOFError, a
 flipped bit with SIGABRT. Here each file of the cache carries a digest. One that is damaged is compiled anew.
@@ -26,11 +26,11 @@ _DIGEST_BYTES = 32
 _log = logging.getLogger(__name__)
 
 inner = numba.njit(no_cpython_wrapper=True, **_PLAIN)
-"""Decorates what is called by compiled functions of the same file alone."""
+"""Decorator of functions that only compiled functions of the same file call."""
 
 
 def compiled(*arguments: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Decorator: compiled for arguments of these types when it is imported, cached as by `cached`."""
+    """Return a decorator that compiles for arguments of these types at import, cached as by `cached`."""
 
     def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
         kept = cached(nogil=True, **_PLAIN)(function)
@@ -43,7 +43,7 @@ def compiled(*arguments: Any) -> Callable[[Callable[..., Any]], Callable[..., An
 
 
 def cached(**options: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Decorator: `numba.njit` with these options, whose results are kept where a folder for them can be written.
+    """Return the decorator `numba.njit` with these options, cached where a folder can be written.
 
     Where there is none, each process compiles for itself, some seconds, and is then as fast as others.
     """
@@ -59,17 +59,17 @@ def cached(**options: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]
 
 
 def given(dtype: Any, axes: int = 1) -> Any:
-    """Type of an array that is only read."""
+    """Return the type of an array that is only read."""
     return types.Array(dtype, axes, "C", readonly=True)
 
 
 def written(dtype: Any, axes: int = 1) -> Any:
-    """Type of an array that is written: results, or room to work in."""
+    """Return the type of an array that is written: results, or scratch memory."""
     return types.Array(dtype, axes, "C")
 
 
 class _CheckedCache(FunctionCache):
-    """numba's cache of a function, in files that tell whether they are whole."""
+    """numba's cache of a function, in files with digests."""
 
     warned = False  # once a process, of the first function
 
@@ -79,7 +79,7 @@ class _CheckedCache(FunctionCache):
         self._cache_file = _CheckedFile(self._cache_path, self._impl.filename_base, locator.get_source_stamp())
 
     def save_overload(self, signature: Any, data: Any) -> None:
-        """Keep what was compiled, if it can be written; this process goes on with it in any case."""
+        """Save the compiled function if the file can be written; this process uses it in any case."""
         try:
             super().save_overload(signature, data)
         except OSError as error:
@@ -93,7 +93,7 @@ class _CheckedCache(FunctionCache):
 
 
 class _CheckedFile(IndexDataCacheFile):
-    """Index and data of a cached function, each with a digest at its end, which numba's own reading passes over."""
+    """Index and data of a cached function, each followed by a digest, which numba ignores."""
 
     def _load_index(self) -> Any:
         return super()._load_index() if _is_whole(Path(self._index_path)) else {}
@@ -101,7 +101,7 @@ class _CheckedFile(IndexDataCacheFile):
     def _load_data(self, name: str) -> Any:
         path = Path(self._data_path(name))
         if not _is_whole(path):
-            raise FileNotFoundError(path)  # which means to numba that it is to be compiled
+            raise FileNotFoundError(path)  # lets numba compile the function
         return super()._load_data(name)
 
     @contextlib.contextmanager

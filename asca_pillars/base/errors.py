@@ -1,4 +1,4 @@
-"""Errors that are the user's to mend: one line that names the file, the value and the remedy.
+"""User errors: one line that names the file, the value and the remedy.
 
 Exit codes of the command line are those of the errors' kinds; docs/guide/deploy.md lists them.
 """
@@ -52,13 +52,13 @@ class BundleError(AscaError):
 
 
 class OutputError(AscaError):
-    """A place to write to that holds something which is not ours to replace."""
+    """An output place that holds something that must not be replaced."""
 
     exit_code = USAGE
 
 
 class ProviderError(AscaError):
-    """Hardware or a runtime library that was asked for and is not there, or does not start."""
+    """Hardware or a runtime library that was requested and is missing, or does not start."""
 
 
 class ExportError(AscaError):
@@ -82,7 +82,7 @@ class TrainingError(AscaError):
 
 
 def printable(text: str, limit: int = 1000) -> str:
-    """A message as one line of at most `limit` characters that does nothing to a terminal.
+    """Return a message as one printable line of at most `limit` characters.
 
     Messages quote what stands in files: control characters are written as escapes, and a long text loses its middle.
     """

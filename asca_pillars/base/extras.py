@@ -1,4 +1,4 @@
-"""Optional parts of the installation, and what to say when one is missing."""
+"""Optional extras of the installation, and the error when one is missing."""
 
 import importlib.util
 
@@ -20,7 +20,7 @@ EXTRAS = {
 
 
 def missing_modules(extra: str) -> list[str]:
-    """Modules of an extra that are not installed."""
+    """Return modules of an extra that are not installed."""
     return [name for name in EXTRAS[extra] if importlib.util.find_spec(name) is None]
 
 

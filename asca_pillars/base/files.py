@@ -22,7 +22,7 @@ from asca_pillars.base.own_files import Recognizer, require_no_link, require_rep
 
 WEIGHTS_FILE: Literal["weights.ckpt"] = "weights.ckpt"
 """Trained weights alone, among the checkpoints of a run and in a bundle."""
-_LONGEST_NAME_BYTES = 255  # of a file, on nearly every file system
+_LONGEST_NAME_BYTES = 255  # limit of nearly every file system
 _NOT_PLAIN = re.compile(r"[^A-Za-z0-9._-]")
 _RESERVED = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\.|$)", re.IGNORECASE)  # devices of Windows
 _LONGEST_NAME = 100  # characters; systems allow 255 bytes, suffixes and the names of temporary files included
@@ -107,7 +107,7 @@ def write_text(path: str | Path, text: str) -> None:
 
 
 def portable_name(text: str) -> str:
-    """The name of one file for a text that comes from data: itself if it is a plain name on every system.
+    """Return the name of one file for a text that comes from data: itself if it is a plain name on every system.
 
     Anything but ASCII letters, digits, dot, dash and underscore becomes an underscore. What had to be changed gets a
     digest of the text, so that different texts keep different names.
@@ -121,9 +121,9 @@ def portable_name(text: str) -> str:
 
 
 def file_inside(folder: Path, name: str) -> Path | None:
-    """The file that a name from data stands for, relative to `folder`; None if there is none, or it leads out of it.
+    """Return the file below `folder` that a name from data stands for; None if there is none, or it leads outside.
 
-    Links in the folder are followed: whoever made the folder put them there.
+    Links in the folder are followed.
     """
     relative = Path(name)
     if relative.is_absolute() or relative.drive or ".." in relative.parts:
@@ -135,7 +135,7 @@ def file_inside(folder: Path, name: str) -> Path | None:
 
 
 def is_hidden(relative: Path) -> bool:
-    """Whether it or a folder on the way to it is; `relative` to the folder that is searched."""
+    """Return whether a path or one of its folders is hidden; `relative` to the folder that is searched."""
     return any(part.startswith(".") for part in relative.parts)
 
 
@@ -158,7 +158,7 @@ def _make_folder(folder: Path) -> None:
 
 @contextlib.contextmanager
 def _temporary(target: Path, stem: str, suffix: str, *, folder: bool) -> Iterator[Path]:
-    """A new file or folder beside `target`, locked; removed at the end if it is still there."""
+    """Yield a new, locked file or folder beside `target`; it is removed at the end if it is still there."""
     while True:
         temporary = target.with_name(f".{stem}.asca-{secrets.token_hex(4)}{suffix}")
         # The kernel applies the umask: reading it from here would change it for all threads.

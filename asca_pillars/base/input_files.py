@@ -1,4 +1,4 @@
-"""Input files: what is at a path is a regular file with content of its own, before anything reads it."""
+"""Check that an input path is a regular file with content of its own, before it is read."""
 
 import stat
 from pathlib import Path
@@ -18,7 +18,7 @@ _KINDS = (
 def require_content(path: str | Path, error: type[AscaError]) -> None:
     """Make sure that reading a file ends and gives the file's own content.
 
-    A path where nothing is, or a folder, is left to whoever opens it.
+    A missing path, or a folder, is left to the caller's `open`.
 
     Args:
         path: of the file; links are followed.
@@ -43,7 +43,7 @@ def require_content(path: str | Path, error: type[AscaError]) -> None:
 
 
 def read_text(path: str | Path, error: type[AscaError], *, errors: str = "strict") -> str:
-    """The UTF-8 text of a file that `require_content` lets pass, without a byte-order mark.
+    """Read a file that `require_content` accepts as UTF-8 text, without a byte-order mark.
 
     Args:
         path: of the file.

@@ -8,7 +8,7 @@ _PROJECT = 'name = "asca-pillars"'
 
 
 def source_tree() -> Path | None:
-    """The source tree that this code runs from; None where a wheel was installed."""
+    """Return the source tree that this code runs from; None where a wheel was installed."""
     root = Path(__file__).parents[2]
     try:
         text = (root / "pyproject.toml").read_text(encoding="utf-8")
@@ -18,7 +18,7 @@ def source_tree() -> Path | None:
 
 
 def install_command(extra: str) -> str:
-    """The command that adds what an extra needs, such as `pip install 'asca-pillars[train]'`.
+    """Return the command that adds what an extra needs, such as `pip install 'asca-pillars[train]'`.
 
     Neither form needs the package to be on an index: of a wheel that is installed pip reads the requirements where it
     lies.
@@ -30,13 +30,13 @@ def install_command(extra: str) -> str:
 
 
 def upgrade_advice() -> str:
-    """How to get a newer version."""
+    """Return the advice to install a newer version."""
     root = source_tree()
     return "install a newer asca-pillars" if root is None else f"upgrade with `git -C {shlex.quote(str(root))} pull`"
 
 
 def shipped_bundles() -> dict[str, Path]:
-    """Folders of the bundles that come with the runtime, by name; the runtime is not imported."""
+    """Return the folders of the bundles that come with the runtime, by name; the runtime is not imported."""
     runtime = importlib.util.find_spec("asca_deploy")
     places = [] if runtime is None else runtime.submodule_search_locations or []
     return {path.parent.name: path.parent for place in places for path in Path(place).glob("bundles/*/bundle.json")}

@@ -1,4 +1,4 @@
-"""The compiled loops of a module, such as those of `rotated_nms` and `pillarize`, imported when they are first needed.
+"""Compiled kernels of a module, such as those of `rotated_nms` and `pillarize`, imported on first use.
 
 Each module names its own kernels, so that a detector of one stage, or without rulebooks, does not wait for the others.
 """
@@ -10,7 +10,7 @@ from types import ModuleType
 
 @cache
 def load_kernels(module: str) -> ModuleType:
-    """The compiled functions of a module.
+    """Return the compiled functions of a module.
 
     The first call of a process imports numba and takes a few tenths of a second; the very first one on a machine
     compiles, some seconds.

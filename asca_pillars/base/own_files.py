@@ -71,12 +71,12 @@ def ending_with(text: str) -> Recognizer:
 
 
 def written_by(command: str) -> str:
-    """The sentence by which `command` recognizes a text that it wrote."""
+    """Return the sentence by which `command` recognizes a text that it wrote."""
     return f"Written by `{command}`, which may replace it."
 
 
 def page_end(command: str) -> str:
-    """The last lines of a Markdown page that `command` writes: the sentence, which is not shown to readers."""
+    """Return the last lines of a Markdown page that `command` writes: the sentence, which is not shown to readers."""
     return f"\n<!-- {written_by(command)} -->\n"
 
 

@@ -1,4 +1,4 @@
-"""One job for each of many items, in processes of their own, with a progress bar."""
+"""Parallel execution of a job for many items in processes, with a progress bar."""
 
 import contextlib
 import math
@@ -33,7 +33,7 @@ def in_processes(
     progress: bool = True,
     console: Console | None = None,
 ) -> Iterator[Result]:
-    """The results of a job for each item, in the order of the items, each as soon as it is there.
+    """Yield the results of a job for each item, in the order of the items, each as soon as it is there.
 
     Args:
         job: one that can be sent to a process, if more than one works.
@@ -67,14 +67,14 @@ others, and the one that started them, then wait forever.
 
 
 class _Failed(NamedTuple):
-    """In the place of a result, the error of the job."""
+    """Error of a job, in the place of its result."""
 
     error: Exception
 
 
 @contextlib.contextmanager
 def _pool(job: Callable[[Any], Any], workers: int) -> Iterator[_Pool]:
-    """Processes that do a job for the items that they are sent, and end with the block.
+    """Start processes that run a job on the items sent to them, until the block ends.
 
     Raises:
         WorkerError: one cannot be started.
@@ -103,7 +103,7 @@ def _pool(job: Callable[[Any], Any], workers: int) -> Iterator[_Pool]:
 
 
 def _shared_out(todo: Sequence[Any], at_once: int, pool: _Pool) -> Iterator[Any]:
-    """The results of the items, in their order.
+    """Yield the results of the items in their order.
 
     Raises:
         Exception: that of the job.
@@ -134,9 +134,9 @@ def _shared_out(todo: Sequence[Any], at_once: int, pool: _Pool) -> Iterator[Any]
 
 
 def _work(job: Callable[[Any], Any], connection: Connection) -> None:
-    """In a new process: do the job for items as long as there are some."""
+    """Run the job in a new process for the items received, until the connection ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches it, too; the process that started it ends it
-    with contextlib.suppress(EOFError, ConnectionError):  # that one has ended
+    with contextlib.suppress(EOFError, ConnectionError):  # the other process has ended
         while True:
             connection.send(_results(job, connection.recv()))
 
@@ -155,7 +155,7 @@ def _results(job: Callable[[Any], Any], items: Sequence[Any]) -> list[Any]:
 
 @contextlib.contextmanager
 def one_thread_per_process() -> Iterator[None]:
-    """The processes started inside compute with one thread each: the processes are the parallelism."""
+    """Let the processes started inside the block compute with one thread each, as they run in parallel."""
     before = {name: os.environ.get(name) for name in _THREADS}
     os.environ.update(dict.fromkeys(_THREADS, "1"))
     try:

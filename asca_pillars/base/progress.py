@@ -1,4 +1,4 @@
-"""Progress and remarks of long work: told to callbacks, never printed."""
+"""Progress and remarks of long work, passed to callbacks and never printed."""
 
 from collections.abc import Callable, Iterable, Iterator
 from typing import TypeAlias, TypeVar
@@ -8,7 +8,7 @@ Item = TypeVar("Item")
 Progress: TypeAlias = Callable[[str, int, int], None]
 """Called with the name of a step, how many parts of it are done, and how many there are."""
 Remark: TypeAlias = Callable[[str], None]
-"""Called with a sentence that the user should know, as soon as it is known."""
+"""Called with a sentence for the user, as soon as it is known."""
 
 
 class Reporter:
@@ -33,7 +33,7 @@ class Reporter:
             self._remark(text)
 
     def track(self, items: Iterable[Item], step: str, total: int | None = None, done: int = 0) -> Iterator[Item]:
-        """The items; after each one the progress callback is called.
+        """Yield the items; after each one the progress callback is called.
 
         Args:
             items: to pass on.
@@ -53,4 +53,4 @@ class Reporter:
 
 
 SILENT = Reporter()
-"""Reports to nobody; for functions that only track."""
+"""Reporter without callbacks; for functions that only track."""

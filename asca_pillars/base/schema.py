@@ -23,7 +23,7 @@ def parse(type_: type[T], data: dict[str, Any], source: str) -> T:
     Args:
         type_: a dataclass whose fields are plain values, dataclasses or tuples of them.
         data: what a YAML or JSON file held.
-        source: the file or command-line option to blame in the error.
+        source: the file or command-line option to name in the error.
 
     Raises:
         ConfigError: an unknown key (the nearest one that exists is named), a missing or an unusable value.
@@ -42,7 +42,7 @@ def parse(type_: type[T], data: dict[str, Any], source: str) -> T:
 
 
 def _flag_for_number(given: Any, taken: Any, path: str = "") -> tuple[str, bool] | None:
-    """Where true or false was given and a number was taken, as pydantic does; None: nowhere."""
+    """Return path and value of a boolean where a number was taken, as pydantic converts it; None if there is none."""
     if isinstance(given, dict) and isinstance(taken, dict):
         pairs = [(key, given[key], taken[key]) for key in given if key in taken]
     elif isinstance(given, list | tuple) and isinstance(taken, list):
@@ -54,14 +54,14 @@ def _flag_for_number(given: Any, taken: Any, path: str = "") -> tuple[str, bool]
 
 
 def to_dict(settings: Any) -> dict[str, Any]:
-    """Plain values (dict, list, str, int, float, bool, None) of a settings dataclass, for YAML or JSON."""
+    """Return plain values (dict, list, str, int, float, bool, None) of a settings dataclass, for YAML or JSON."""
     plain: dict[str, Any] = _adapter(type(settings)).dump_python(settings, mode="json")  # type: ignore[arg-type]
     return plain
 
 
 @cache
 def _adapter(type_: Any) -> pydantic.TypeAdapter[Any]:
-    """Made once a type: it takes milliseconds."""
+    """Return the adapter of a type, cached because it takes milliseconds to build."""
     return pydantic.TypeAdapter(type_)
 
 
@@ -86,7 +86,7 @@ def _explain(type_: type, error: Any) -> str:
 
 
 def _without_tags(type_: Any, location: list[Any]) -> list[Any]:
-    """The path that a person would write: pydantic puts the tag of a union's member after the union's own key."""
+    """Return a path without the tags that pydantic inserts after a union's key."""
     for index, part in enumerate(location[:-1]):
         if not dataclasses.is_dataclass(type_):
             break
@@ -97,7 +97,7 @@ def _without_tags(type_: Any, location: list[Any]) -> list[Any]:
 
 
 def _members(type_: Any) -> dict[Any, Any]:
-    """The dataclasses of a tagged union by tag; none for any other type."""
+    """Return the dataclasses of a tagged union by tag; none for any other type."""
     if get_origin(type_) is not Annotated:
         return {}
     first, *notes = get_args(type_)
@@ -107,7 +107,7 @@ def _members(type_: Any) -> dict[Any, Any]:
 
 
 def _type_at(type_: Any, location: list[Any]) -> Any:
-    """The dataclass that the path `location` leads to from `type_`."""
+    """Return the dataclass that the path `location` leads to from `type_`."""
     for part in location:
         if part in (members := _members(type_)):
             type_ = members[part]

@@ -14,7 +14,7 @@ MAX_CHARACTERS, MAX_DEPTH = 100_000, 30
 
 
 def parse_yaml(text: str) -> Any:
-    """The value that a YAML text writes: dicts, lists, strings, numbers, booleans, dates or None.
+    """Parse a YAML text into dicts, lists, strings, numbers, booleans, dates or None.
 
     Raises:
         yaml.YAMLError: no valid YAML, or YAML with what settings do not need: aliases (ten lines of them can stand for
@@ -53,7 +53,7 @@ T = TypeVar("T")
 
 
 def shipped_configs(kind: str = "") -> dict[str, Path]:
-    """The configurations that come along, by name: those of the installed package, or of the checkout.
+    """Return the shipped configurations by name: those of the installed package, or of the checkout.
 
     Args:
         kind: folder below configs/ for those of something else than a model.
@@ -64,7 +64,7 @@ def shipped_configs(kind: str = "") -> dict[str, Path]:
 
 
 def read_settings(type_: type[T], path: str | Path, overrides: Sequence[str], shipped: Mapping[str, Path]) -> T:
-    """Settings of a dataclass from a YAML file that holds what differs from its defaults.
+    """Read the settings of a dataclass from a YAML file that holds what differs from its defaults.
 
     Args:
         type_: the dataclass.

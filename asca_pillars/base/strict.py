@@ -1,4 +1,4 @@
-"""The base of settings, and numbers within their bounds. Geometry has settings, too, and shall not need pydantic."""
+"""Base class of settings, and checks of bounds; free of pydantic, for `geometry`."""
 
 import math
 import reprlib
@@ -14,7 +14,7 @@ class Strict:
     __pydantic_config__: ClassVar[dict[str, Any]] = {"extra": "forbid", "allow_inf_nan": False}
 
 
-_LARGEST = 2.0**53  # of settings: up to here a float counts every whole number
+_LARGEST = 2.0**53  # largest number in settings: up to here a float holds every integer
 
 
 def require_bounds(section: str, settings: Strict, names: Sequence[str], *, low: float, high: float = math.inf) -> None:

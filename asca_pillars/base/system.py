@@ -1,4 +1,4 @@
-"""The computer, and what a result depends on beside its inputs: cores granted, versions, source revision."""
+"""Properties of the computer and the software that results depend on: granted cores, versions, source revision."""
 
 import functools
 import importlib.metadata
@@ -29,7 +29,7 @@ PACKAGES = (
 
 
 def default_threads() -> int:
-    """Physical cores granted to this process: its CPU affinity, its control group's quota, at least 1.
+    """Return the physical cores granted to this process: its CPU affinity, its control group's quota, at least 1.
 
     Two hardware threads of one core share the arithmetic units that a network keeps busy, so that a second
     thread per core brings waiting, not speed. A quota is rounded down: a thread that only gets part of its
@@ -44,7 +44,7 @@ def default_threads() -> int:
 
 
 def check_threads(threads: int | None) -> int:
-    """The number of CPU threads to use: as asked for, or `default_threads` for None.
+    """Return the number of CPU threads to use: the given one, or `default_threads` for None.
 
     Raises:
         ConfigError: no whole number, less than one, or more than four for each CPU of the machine, which only wait for
@@ -59,7 +59,7 @@ def check_threads(threads: int | None) -> int:
 
 
 def physical_cores(cpuinfo: str, allowed: set[int]) -> int:
-    """Different physical cores among the logical CPUs `allowed`, by the text of /proc/cpuinfo.
+    """Count the physical cores among the logical CPUs `allowed`, by the text of /proc/cpuinfo.
 
     A CPU whose core is not named there (ARM, some virtual machines) counts as a core of its own.
     """
@@ -72,7 +72,7 @@ def physical_cores(cpuinfo: str, allowed: set[int]) -> int:
 
 
 def cpu_quota(proc: Path = PROC, cgroup: Path = CGROUP) -> float:
-    """CPUs' worth of time that the control groups (v1 or v2, and their parents) grant; inf if unlimited."""
+    """Return CPUs' worth of time that the control groups (v1 or v2, and their parents) grant; inf if unlimited."""
     quota = math.inf
     for line in _read(proc / "self" / "cgroup").splitlines():
         _, controllers, path = line.split(":", 2)
@@ -92,7 +92,7 @@ def cpu_quota(proc: Path = PROC, cgroup: Path = CGROUP) -> float:
 
 
 def cpu_model() -> str:
-    """Name of the processor as the operating system gives it."""
+    """Return the name of the processor as the operating system gives it."""
     for cpu in _cpuinfo_blocks(_read(PROC / "cpuinfo")):
         for key in ("model name", "Model", "Hardware"):
             if key in cpu:
@@ -101,7 +101,7 @@ def cpu_model() -> str:
 
 
 def git_revision() -> str | None:
-    """Revision of the source checkout this code runs from, `-dirty` if it was changed; None when installed."""
+    """Return the revision of the source checkout of this code, `-dirty` if it was changed; None when installed."""
     root = Path(__file__).parents[2]
     try:
         run = subprocess.run(
@@ -117,7 +117,7 @@ def git_revision() -> str | None:
 
 @functools.cache
 def own_version() -> str:
-    """The version of asca-pillars; "unknown" where it is run without being installed."""
+    """Return the version of asca-pillars; "unknown" where it is run without being installed."""
     try:
         return importlib.metadata.version("asca-pillars")
     except importlib.metadata.PackageNotFoundError:
@@ -125,7 +125,7 @@ def own_version() -> str:
 
 
 def package_versions() -> dict[str, str]:
-    """Versions of Python and of the installed packages that a result depends on."""
+    """Return versions of Python and of the installed packages that a result depends on."""
     versions = {"python": platform.python_version()}
     for package in PACKAGES:
         try:
@@ -136,12 +136,12 @@ def package_versions() -> dict[str, str]:
 
 
 def command_line() -> str:
-    """The command as it was typed, without the folder of the program."""
+    """Return the command as it was typed, without the folder of the program."""
     return " ".join([Path(sys.argv[0]).name, *sys.argv[1:]])
 
 
 def describe_environment() -> dict[str, Any]:
-    """All of it as plain values, to be saved beside a result."""
+    """Return the environment of the process as plain values, to be saved beside a result."""
     return {
         "command": command_line(),
         "git_revision": git_revision(),

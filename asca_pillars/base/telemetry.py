@@ -1,4 +1,4 @@
-"""Dependencies that report to their makers, switched off before they are imported.
+"""Telemetry of dependencies, disabled before they are imported.
 
 onnxruntime reports from 1.32 on, from its import on: it leaves a lasting identifier in the home folder and looks a host
 up. Ray reports where nobody has refused. Both read the environment, and hand it on to the processes that they start.
@@ -17,5 +17,5 @@ def disable_telemetry() -> None:
 
 
 def onnxruntime_may_report() -> bool:
-    """Return whether the user asks for onnxruntime's reports: ORT_DISABLE_TELEMETRY is set to 0."""
+    """Return whether the user enables onnxruntime's reports: ORT_DISABLE_TELEMETRY is set to 0."""
     return os.environ["ORT_DISABLE_TELEMETRY"].lower() not in _YES

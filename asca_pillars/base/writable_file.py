@@ -1,4 +1,4 @@
-"""A file that a command ends with, looked at before the work that goes into it."""
+"""Check of an output file before the work whose result it will hold."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -12,7 +12,7 @@ from asca_pillars.base.own_files import Recognizer, require_own_file
 def require_writable(
     path: Path | None, command: str, is_own: Recognizer, inputs: Iterable[str | Path | None] = ()
 ) -> None:
-    """Make sure that minutes of work do not end with a file that cannot be written; None is no file.
+    """Make sure that a file can be written before minutes of work; None is no file.
 
     Arguments and errors: as of `require_own_file`.
     """
@@ -34,4 +34,4 @@ def require_suffix(option: str, path: Path, suffix: str) -> None:
 
 
 class _NotYetError(Exception):
-    """Ends a writing before anything stands under the final name."""
+    """Aborts a write before anything stands under the final name."""

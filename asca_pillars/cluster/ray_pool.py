@@ -1,4 +1,4 @@
-"""Ray, which runs shards on the workers of a cluster. Nothing else in the package knows of it."""
+"""Shards on the workers of a Ray cluster; no other module uses Ray."""
 
 import contextlib
 import logging
@@ -49,7 +49,7 @@ class RayPool(Generic[Result]):
 
     Args:
         job: called with a shard on a worker; it and its result have to be picklable.
-        seen: a file that every machine must see, so that results do not go to a disk that nobody looks at.
+        seen: a file that every machine must see, so that results do not go to a local disk.
         cpus: CPUs of a job.
         gpus: GPUs of a job.
     """
@@ -75,7 +75,7 @@ class RayPool(Generic[Result]):
         return len(self._running) < self._limit
 
     def fits(self) -> bool:
-        """Whether a machine of the cluster is large enough for a job; if not, jobs wait until one joins."""
+        """Return whether a machine of the cluster is large enough for a job; if not, jobs wait until one joins."""
         import ray
 
         resources = [node["Resources"] for node in ray.nodes() if node["Alive"]]

@@ -35,7 +35,7 @@ class Shard(NamedTuple):
 
 
 def cut(items: Sequence[Any], size: int) -> list[Shard]:
-    """Shards of `size` items, the last one of what is left."""
+    """Cut items into shards of `size`; the last one holds the rest."""
     return [Shard(first, tuple(items[first : first + size])) for first in range(0, len(items), size)]
 
 
@@ -76,7 +76,7 @@ class ShardFolder:
         return size
 
     def done(self, shards: Iterable[Shard]) -> set[str]:
-        """Names of those shards whose results are there and whole; every file is read."""
+        """Return the names of those shards whose results are present and intact; every file is read."""
         # One listing: a file that was looked for and not found may stay unseen on a network mount for a minute.
         with os.scandir(self.path) as entries:
             there = {entry.name for entry in entries}
@@ -94,7 +94,7 @@ class ShardFolder:
             self._file(part).unlink()
 
     def lines(self, shards: Iterable[Shard]) -> Iterator[str]:
-        """The results of the shards, in their order.
+        """Yield the results of the shards in their order.
 
         Raises:
             OutputError: one is not there, or damaged.
@@ -121,7 +121,7 @@ class ShardFolder:
         return True
 
     def _lines(self, shard: Shard) -> Iterator[str]:
-        """The lines of one shard; _DamagedError at the first that is not what was written, or if some are missing."""
+        """Yield the lines of one shard; _DamagedError at the first that is not as written, or if some are missing."""
         count = 0
         with self._file(shard).open("rb") as file:
             for line in file:
@@ -149,8 +149,8 @@ def _key(shard: Shard, number: int) -> str:
 Result = TypeVar("Result")
 
 TRIES = {"worker": 3, "machine": 10, "file system": 3}
-"""After so many deaths of the worker or the machine under it a shard is halved, or given up if it is a single item. A
-machine's death says little about the shard; a worker's may be its fault. A file system gets so many tries."""
+"""Deaths of the worker or its machine after which a shard is halved, or given up if it is a single item. A machine's
+death says little about the shard; a worker's may be its fault. Also the number of attempts at a file system."""
 
 
 @dataclass(frozen=True)

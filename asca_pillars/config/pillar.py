@@ -81,7 +81,7 @@ class LossConfig(Strict):
 
 
 TRACED_PILLARS = 6
-"""Of the example that an export traces the encoder with."""
+"""Number of pillars in the example that an export traces the encoder with."""
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,7 @@ class PillarModel(Strict):
     """ASCA-PointPillars and PointPillars: one stage on pillars.
 
     Attributes:
-        kind: tells the families of detectors apart.
+        kind: family of the detector.
         spec: grid, limits, classes and post-processing, which training and the vehicle share.
         network: widths and depths.
         loss: weights of the loss.

@@ -74,13 +74,13 @@ class PvRcnnModel(Strict):
     """PV-RCNN (arXiv 1912.13192): voxels, keypoints and two stages trained together.
 
     Attributes:
-        kind: tells the families of detectors apart.
+        kind: family of the detector.
         spec: grid, strides, classes and post-processing, which training and the vehicle share.
         settings: keypoints, proposals and neighbors, likewise.
         network: widths.
         training_proposals: which boxes of the first stage a training step draws from.
         rois: how many of them it draws for each frame.
-        box_loss: of the second stage's boxes; `va` adds AFE-RCNN's distance IoU seen from above to residuals and
+        box_loss: of the second stage's boxes; `va` adds AFE-RCNN's BEV distance IoU to residuals and
             corners.
         scores: of refined boxes: `second`, the second stage's as published, or `both`, the geometric mean with the
             proposal's.
@@ -89,7 +89,7 @@ class PvRcnnModel(Strict):
     """
 
     FIRST_STAGE: ClassVar[tuple[str, ...]] = ("voxels", "neck", "head")
-    """The parts of the network that propose, by the names of `PvRcnn`."""
+    """Parts of the network that propose, by the names of `PvRcnn`."""
 
     kind: Literal["pv_rcnn"] = "pv_rcnn"
     spec: VoxelSpec = field(default_factory=VoxelSpec)

@@ -25,7 +25,7 @@ Precision = Literal["auto", "fp32", "bf16"]
 
 
 def _family(settings: Any) -> Any:
-    """The `kind` of a model's section; one that says nothing is of pillars, as all were before there were others."""
+    """Return the `kind` of a model's section; a section without one is of pillars, as in older files."""
     kind = settings.get("kind", "pillar") if isinstance(settings, dict) else getattr(settings, "kind", None)
     return None if kind is None else str(kind)
 
@@ -70,7 +70,7 @@ class InsertConfig(Strict):
                 raise ConfigError(f"augment.insert.proportions.{name} = {share:g}: must be at least 0")
 
     def inserts_in(self, epoch: int) -> bool:
-        """Whether objects are inserted in an epoch, counted from 0."""
+        """Return whether objects are inserted in an epoch, counted from 0."""
         return self.method != "none" and (self.disable_after_epoch is None or epoch < self.disable_after_epoch)
 
 
@@ -119,7 +119,7 @@ class AugmentConfig(Strict):
 
 @dataclass(frozen=True)
 class DataConfig(Strict):
-    """What is read from a dataset.
+    """Settings for reading a dataset.
 
     Attributes:
         train_set, val_set: names of lists in ImageSets/.
@@ -187,7 +187,7 @@ class TrainConfig(Strict):
 
 @dataclass(frozen=True)
 class Config(Strict):
-    """One model a person would train: what it sees, what it is, how it learns."""
+    """Configuration of a detector and its training."""
 
     name: str = "asca_pointpillars"
     model: ModelConfig = field(default_factory=PillarModel)
@@ -205,7 +205,7 @@ class Config(Strict):
             self._require_still_objects()
 
     def _require_still_objects(self) -> None:
-        """The first stage has seen each frame once, as it is: nothing may move in it but the whole scene."""
+        """Refuse augmentation of single objects: the first stage has run once on each frame, unaugmented."""
         augment = self.augment
         moves = {
             "insert.method": augment.insert.method,
@@ -223,7 +223,7 @@ class Config(Strict):
 
 
 def pillar_spec(config: Config) -> PillarSpec:
-    """The numbers of a pillar detector, with or without a second stage.
+    """Return the spec of a pillar detector, with or without a second stage.
 
     Raises:
         ConfigError: the model is of another kind.

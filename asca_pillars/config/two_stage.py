@@ -64,7 +64,7 @@ class RefineModel(Strict):
     """A second stage that refines the proposals of a trained pillar detector, which stays as it is.
 
     Attributes:
-        kind: tells the families of detectors apart.
+        kind: family of the detector.
         first_stage: a checkpoint of a pillar detector, or a float32 bundle that holds one: its folder, or the name of
             one that ships.
         first_stage_identity: of its trained weights; `asca train` fills it in.

@@ -27,9 +27,9 @@ class ClassSpec(Strict):
     z_m: float
     """z of the anchor's center, LiDAR frame."""
     positive_iou: float
-    """An anchor that overlaps a box at least this much is to find it."""
+    """Overlap with a box from which an anchor is positive."""
     negative_iou: float
-    """An anchor that overlaps every box less than this is background; in between it is ignored."""
+    """Overlap with every box below which an anchor is background; in between it is ignored."""
     score_threshold: float = 0.3
     """Detections below this score are not reported."""
 
@@ -68,14 +68,14 @@ KITTI_CLASSES = (
 def make_anchors(
     x_m: NDArray[np.float64], y_m: NDArray[np.float64], classes: tuple[ClassSpec, ...]
 ) -> NDArray[np.float32]:
-    """One box per head cell, class and anchor yaw: (H, W, A, 7) float32, metres, LiDAR frame.
+    """Return anchors for head cells, classes and anchor yaws: (H, W, A, 7) float32, metres, LiDAR frame.
 
     A = 2 * len(classes), class-major: anchor a belongs to class a // 2 and has yaw ANCHOR_YAWS_RAD[a % 2].
 
     Args:
         x_m: (W,) centers of the head map's columns in metres, LiDAR frame; they need not be evenly spaced.
         y_m: (H,) centers of its rows.
-        classes: what the anchors look for.
+        classes: of the anchors.
     """
     anchors = np.empty((len(y_m), len(x_m), len(classes), len(ANCHOR_YAWS_RAD), 7), np.float32)
     anchors[..., 0] = x_m[None, :, None, None]

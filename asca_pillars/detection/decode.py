@@ -1,4 +1,4 @@
-"""Head maps -> Detections: threshold, decode, non-maximum suppression. The last stop of every runtime."""
+"""Decoding of head maps to Detections: thresholds, box decoding, non-maximum suppression."""
 
 import math
 import reprlib
@@ -18,18 +18,18 @@ from asca_pillars.geometry.boxes import DIRECTION_OFFSET_RAD, decode_boxes
 KERNELS = "asca_pillars.geometry.nms_kernels"
 
 LEAST_LOGIT = -1e3
-"""Of anything that can be reported: a score of 0 in every type. Cells that a masked neck never looks at lie below."""
+"""Least logit of a detection; its score is 0 in every type. A masked neck's inactive cells lie below."""
 
 MOST = 2**31 - 1
-"""Of anything that is counted in settings: what an index of 32 bits can name."""
+"""Upper bound of counts in settings: the largest 32-bit index."""
 
 
 @dataclass(frozen=True)
 class PostProcess(Strict):
-    """How head maps become detections."""
+    """Settings for decoding head maps into detections."""
 
     nms_iou: float = 0.01
-    """Of two boxes of a class whose footprints overlap more than this, the better one stays."""
+    """BEV IoU of two boxes of a class above which NMS keeps only the better one."""
     candidates: int = 1000
     """Best boxes of each class that enter the suppression."""
     max_detections: int = 100
@@ -47,7 +47,7 @@ Map = TypeVar("Map")
 
 
 class HeadMaps(NamedTuple, Generic[Map]):
-    """What the head says of one scan (NumPy arrays) or of a batch of them (tensors, with a leading axis B).
+    """Outputs of the head for one scan (NumPy arrays), or for a batch (tensors, with a leading axis B).
 
     Channels are anchor-major, A anchors as in `make_anchors`. Where the head computes at active cells alone, there
     are rows (M, channels) instead of maps (channels, H, W), one for each of these cells.
@@ -83,10 +83,10 @@ def decode(
     cells: NDArray[np.integer[Any]] | None = None,
     direction_offset_rad: float = DIRECTION_OFFSET_RAD,
 ) -> Detections:
-    """Detections of one scan, best first.
+    """Decode the detections of one scan, best first.
 
     Per class: the anchors whose score reaches the class's threshold, the best `candidates` of them, decoded,
-    rotated NMS seen from above. Then the best `max_detections` of all classes. Anchors whose numbers are not finite,
+    rotated BEV NMS. Then the best `max_detections` of all classes. Anchors whose numbers are not finite,
     from a network that overflowed, are left out and counted (`Detections.non_finite`).
 
     Args:
@@ -109,7 +109,7 @@ def decode_candidates(
     cells: NDArray[np.integer[Any]] | None = None,
     direction_offset_rad: float = DIRECTION_OFFSET_RAD,
 ) -> Candidates:
-    """The first half of `decode`: what reaches its class's threshold, (n, 7) boxes in the LiDAR frame.
+    """Return candidates that reach their class's threshold, for `suppress`: (n, 7) boxes in the LiDAR frame.
 
     Raises:
         ValueError: if maps, anchors and classes do not belong together.
@@ -135,7 +135,7 @@ def decode_candidates(
     logits = scores[row, anchor]
     residuals = rows.boxes.reshape(-1, count, 7)[row, anchor]
     directions = rows.directions.reshape(-1, count, 2)[row, anchor]
-    with np.errstate(over="ignore", invalid="ignore"):  # what overflows is left out below
+    with np.errstate(over="ignore", invalid="ignore"):  # overflows are left out below
         own = anchors.reshape(-1, count, 7)[cell, anchor]
         boxes = decode_boxes(residuals, directions.argmax(axis=-1), own, direction_offset_rad)
     usable = np.isfinite(boxes).all(axis=1) & np.isfinite(directions).all(axis=1) & np.isfinite(logits)
@@ -151,9 +151,9 @@ def decode_candidates(
 def suppress(
     candidates: Candidates, classes: tuple[ClassSpec, ...], post: PostProcess, most: int | None = None
 ) -> Detections:
-    """The second half of `decode`: (n, 7) candidates -> those that the rotated NMS of their class keeps, best first.
+    """Suppress (n, 7) candidates by the rotated NMS of their class, the second half of `decode`; best first.
 
-    Of each class no more than `most`.
+    At most `most` of each class are kept.
     """
     boxes, logits, labels, non_finite = candidates
     limit = post.max_detections if most is None else min(most, post.max_detections)
@@ -175,7 +175,7 @@ def nms_by_class(
     iou_threshold: float,
     limit: int | None = None,
 ) -> NDArray[np.int64]:
-    """`rotated_nms` within each class: (N, 7), (N,), (N,) -> indices of the kept boxes, class after class."""
+    """Apply `rotated_nms` within each class: (N, 7), (N,), (N,) -> indices of the kept boxes, class after class."""
     kept = [np.empty(0, np.int64)]
     for label in np.unique(labels):
         own = np.flatnonzero(labels == label)
@@ -186,7 +186,7 @@ def nms_by_class(
 def rotated_nms(
     boxes: NDArray[np.floating[Any]], scores: NDArray[np.floating[Any]], iou_threshold: float, limit: int | None = None
 ) -> NDArray[np.int64]:
-    """Greedy suppression by `bev_iou`: indices of the kept boxes, by descending score; of the first `limit` of them.
+    """Return indices of the boxes that greedy NMS by `bev_iou` keeps, by descending score, at most `limit`.
 
     A box is dropped if a kept, better one overlaps it by more than `iou_threshold`. Of equal scores the
     earlier goes first.
@@ -203,9 +203,9 @@ def rotated_nms(
 def _candidates(
     scores: NDArray[np.float32], labels: NDArray[np.int64] | None, classes: tuple[ClassSpec, ...], limit: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Anchor (n,) and row (n,) in scores (M, A) of the best anchors of each class, class by class, best first.
+    """Return anchor (n,) and row (n,) in scores (M, A) of the best anchors of each class, class by class, best first.
 
-    `labels` (M, A) are the classes that the scores are for; None: each anchor's own.
+    `labels` (M, A) are the classes of the scores; None: each anchor's class.
 
     Of equal scores that of the earlier anchor goes first, and among those that of the earlier row.
     """
@@ -228,7 +228,7 @@ def _candidates(
 
 
 def _labels(anchor: NDArray[np.int64], row: NDArray[np.int64], labels: NDArray[np.int64] | None) -> NDArray[np.int64]:
-    """Classes (n,) of what anchors (n,) in rows (n,) of `labels` (M, A) say, see `_candidates`."""
+    """Return the classes (n,) in `labels` (M, A) of anchors (n,) in rows (n,), see `_candidates`."""
     return anchor // len(ANCHOR_YAWS_RAD) if labels is None else labels[row, anchor]
 
 
@@ -239,5 +239,5 @@ def _logit(probability: float) -> float:
 
 
 def sigmoid(logits: NDArray[np.floating[Any]]) -> NDArray[np.float32]:
-    """Scores in [0, 1], any shape."""
+    """Return scores in [0, 1] from logits of any shape."""
     return np.exp(-np.logaddexp(0.0, -logits.astype(np.float64))).astype(np.float32)

@@ -1,4 +1,4 @@
-"""The result: what was found in one scan."""
+"""Result of a detector: the boxes of one scan, and the report on it."""
 
 import json
 from collections import Counter
@@ -17,11 +17,11 @@ class Detection(NamedTuple):
 
     class_name: str
     score: float
-    """In [0, 1]."""
+    """Score in [0, 1]."""
     x_m: float
     y_m: float
     z_m: float
-    """Of the box's center, not of its bottom."""
+    """Height of the box's center."""
     length_m: float
     width_m: float
     height_m: float
@@ -69,7 +69,7 @@ class Detections:
 
     @classmethod
     def empty(cls, class_names: tuple[str, ...]) -> "Detections":
-        """No boxes."""
+        """Return detections without boxes."""
         return cls(np.empty((0, 7), np.float32), np.empty(0, np.float32), np.empty(0, np.int64), class_names)
 
     def __len__(self) -> int:
@@ -104,7 +104,7 @@ class Detections:
         return np.hypot(self.boxes[:, 0], self.boxes[:, 1])
 
     def to_dicts(self) -> list[dict[str, str | float]]:
-        """For each detection `class`, `score` and the fields of `Detection` from `x_m` on, with four decimals."""
+        """Return `class`, `score` and the fields of `Detection` from `x_m` on of each detection, with four decimals."""
         return [
             {"class": found.class_name}
             | {key: round(value, _DIGITS) for key, value in found._asdict().items() if key != "class_name"}
@@ -112,13 +112,13 @@ class Detections:
         ]
 
     def to_json(self) -> str:
-        """`to_dicts` as JSON text."""
+        """Return `to_dicts` as JSON text."""
         return json.dumps(self.to_dicts())
 
 
 @dataclass(frozen=True)
 class ScanCounts:
-    """What became of a scan's points: points = kept + points_outside + points_over_limit. Families add their own."""
+    """Counts of a scan's points: points = kept + points_outside + points_over_limit. Families add their own."""
 
     points: int
     """Usable points of the scan."""
@@ -129,22 +129,22 @@ class ScanCounts:
 
 
 def summed(counts: Sequence[ScanCounts]) -> ScanCounts:
-    """The counts of a scan's passes, all of one family, added up."""
+    """Sum the counts of a scan's passes, all of one family."""
     first = counts[0]
     return type(first)(**{name.name: sum(getattr(one, name.name) for one in counts) for name in fields(first)})
 
 
 @dataclass(frozen=True)
 class FrameReport:
-    """Record of one scan on its way to the boxes."""
+    """Report on one scan: times, counts, warnings."""
 
     times_ms: dict[str, float]
     """Wall time of each stage by name: "input" (check and conversion of the points), then those of the family."""
     waiting_ms: float
-    """In a stream: the time between the stages, when the scan waited for those before it. Otherwise 0."""
+    """Time that the scan waited between stages in a stream; otherwise 0."""
     counts: ScanCounts
-    """What the ranges and the limits made of the usable points; a pillar detector's are `PillarCounts`. Added up over
-    the passes, each of which looks at every point."""
+    """Counts of the usable points by ranges and limits; `PillarCounts` for a pillar detector. Summed over the passes,
+    each of which takes every point."""
     non_finite_points: int
     """Points dropped because a value was NaN or infinite."""
     clipped_reflectances: int
@@ -152,9 +152,9 @@ class FrameReport:
     non_finite_outputs: int
     """Anchors left out because the network's answer for them was NaN or infinite."""
     warnings: tuple[str, ...]
-    """How the scan differs from those the model was trained on, and what was repaired; empty if nothing."""
+    """Differences from the scans the model was trained on, and repairs; empty if there are none."""
     passes: int = 1
-    """How often the network ran, each time on the scan turned otherwise. Times are those of all passes together."""
+    """Number of passes of the network, each on the scan turned differently. Times are sums over the passes."""
 
     @property
     def total_ms(self) -> float:

@@ -1,4 +1,4 @@
-"""Head maps -> proposals for a second stage, in two forms: with a quota of each class, or whatever the class."""
+"""Decoding of head maps to proposals for a second stage, with a quota for each class or regardless of class."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -17,16 +17,16 @@ from asca_pillars.geometry.boxes import decode_boxes
 
 @dataclass(frozen=True)
 class ProposalSettings(Strict):
-    """Settings by which a first stage's head maps become proposals."""
+    """Settings for decoding a first stage's head maps into proposals."""
 
     score_threshold: float = 0.05
-    """Of every class: the second stage judges again, and cannot bring back what is not proposed."""
+    """Score threshold of every class: the second stage rescores proposals, and cannot recover missing ones."""
     nms_iou: float = 0.7
-    """Boxes of a class that overlap less are both proposed."""
+    """BEV IoU of two boxes of a class up to which both are proposed."""
     candidates: int = 300
     """Best boxes of each class that enter the suppression."""
     quotas: tuple[int, ...] = (20, 20, 10)
-    """Proposals of each class at most, so that classes with low scores are not crowded out."""
+    """Maximum of proposals for each class, so that classes with low scores are not crowded out."""
 
     def __post_init__(self) -> None:
         for name, value in (("score_threshold", self.score_threshold), ("nms_iou", self.nms_iou)):
@@ -43,7 +43,7 @@ def propose(
     settings: ProposalSettings,
     cells: NDArray[np.integer[Any]] | None = None,
 ) -> Detections:
-    """Proposals of one scan, best first.
+    """Return the proposals of one scan, best first.
 
     Args:
         maps: logits and residuals (channels, H, W) of the detector that `spec` describes; its thresholds and
@@ -61,7 +61,7 @@ def propose(
 
 
 def best_of_each_class(detections: Detections, quotas: Sequence[int]) -> Detections:
-    """The best `quotas[label]` detections of each class, in the order in which they come.
+    """Return the best `quotas[label]` detections of each class, in the order in which they come.
 
     Raises:
         ValueError: not one quota for each class.
@@ -77,11 +77,11 @@ def best_of_each_class(detections: Detections, quotas: Sequence[int]) -> Detecti
 
 @dataclass(frozen=True)
 class AnchorProposals(Strict):
-    """How head maps become proposals, whatever their class; the defaults are PV-RCNN's in use.
+    """Settings for decoding head maps into proposals of any class; the defaults are PV-RCNN's at inference.
 
     Attributes:
         candidates: anchors that enter the suppression, by the best of their scores.
-        nms_iou: boxes that overlap less, seen from above, are both proposed.
+        nms_iou: BEV IoU of two boxes up to which both are proposed.
         count: of the proposals at most.
     """
 
@@ -99,7 +99,7 @@ class AnchorProposals(Strict):
 
 
 def propose_anchors(maps: HeadMaps[NDArray[np.float32]], spec: DetectorSpec, settings: AnchorProposals) -> Detections:
-    """Proposals of one scan, best first, each of the class that its anchor's best score is of.
+    """Return the proposals of one scan, best first, each of the class of its anchor's best score.
 
     Anchors whose numbers are not finite are left out and counted.
 
@@ -123,7 +123,7 @@ def propose_anchors(maps: HeadMaps[NDArray[np.float32]], spec: DetectorSpec, set
     best = scores.max(axis=1)
     finite = np.isfinite(best)
     chosen = _best(np.where(finite, best, -np.inf), min(settings.candidates, int(finite.sum())))
-    with np.errstate(over="ignore", invalid="ignore"):  # what overflows is left out below
+    with np.errstate(over="ignore", invalid="ignore"):  # overflows are left out below
         bins, anchors = directions[chosen].argmax(axis=1), spec.anchors.reshape(-1, 7)[chosen]
         boxes = decode_boxes(residuals[chosen], bins, anchors, spec.direction_offset_rad)
     usable = np.isfinite(boxes).all(axis=1) & np.isfinite(directions[chosen]).all(axis=1)
@@ -136,7 +136,7 @@ def propose_anchors(maps: HeadMaps[NDArray[np.float32]], spec: DetectorSpec, set
 
 
 def _best(scores: NDArray[np.float32], count: int) -> NDArray[np.int64]:
-    """Rows of the `count` largest scores, best first; of equal ones the earlier."""
+    """Return rows of the `count` largest scores, best first; of equal ones the earlier."""
     if count == 0:
         return np.empty(0, np.int64)
     rows = np.flatnonzero(scores >= np.partition(scores, len(scores) - count)[len(scores) - count])

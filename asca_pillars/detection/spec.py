@@ -1,4 +1,4 @@
-"""What every family of detectors shares: where it looks, for which classes, and how its head maps become boxes."""
+"""Settings that all families of detectors share: ranges, classes, and the decoding of head maps into boxes."""
 
 import math
 from abc import ABC, abstractmethod
@@ -48,14 +48,14 @@ class DetectorSpec(Strict, ABC):
     @property
     @abstractmethod
     def ranges(self) -> Ranges:
-        """Where objects are looked for."""
+        """Detection ranges."""
 
     @abstractmethod
     def head_centers_m(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Centers of the head map's cells in metres, LiDAR frame: x of its columns (W,), y of its rows (H,)."""
+        """Return centers of the head map's cells in metres, LiDAR frame: x of its columns (W,), y of its rows (H,)."""
 
     def anchor_centers_m(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Where anchors stand, likewise; in the centers of the cells unless a family says otherwise."""
+        """Return anchor centers, as `head_centers_m`; a family may place them elsewhere than in the cells' centers."""
         return self.head_centers_m()
 
     @cached_property
@@ -71,7 +71,7 @@ class DetectorSpec(Strict, ABC):
         return anchors
 
     def with_score_threshold(self, score: ScoreThresholds) -> Self:
-        """The same detector that reports detections from `score` on: of every class, or of those named, by name.
+        """Return the same detector with other score thresholds: of every class, or of the classes named.
 
         Raises:
             ConfigError: no such class, or no score between 0 and 1.
@@ -89,7 +89,7 @@ class DetectorSpec(Strict, ABC):
         )
 
     def decode(self, maps: HeadMaps[NDArray[np.float32]], cells: NDArray[np.integer[Any]] | None = None) -> Detections:
-        """Detections, LiDAR frame, from head maps of one scan, (channels, H, W) each.
+        """Decode head maps of one scan, (channels, H, W) each, into detections, LiDAR frame.
 
         With `cells` (M,), flat indices: from rows (M, channels) of these head cells.
         """

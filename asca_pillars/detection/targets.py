@@ -1,4 +1,4 @@
-"""Target assignment: which anchors should find which labelled box (PointPillars, arXiv 1812.05784, section 4.2).
+"""Target assignment: matching of anchors with labelled boxes (PointPillars, arXiv 1812.05784, section 4.2).
 
 NumPy, because it runs in the loader's processes beside pillarize and shares the geometry with it.
 """
@@ -15,14 +15,14 @@ from asca_pillars.geometry.boxes import DIRECTION_OFFSET_RAD, encode_boxes, poin
 from asca_pillars.geometry.overlap import aligned_bev_iou
 
 Assigner = Literal["overlap", "atss"]
-"""What makes an anchor positive, see `assign_targets`."""
+"""Rule that makes an anchor positive, see `assign_targets`."""
 
 _NEAREST = 9  # k of ATSS, which its authors found to matter little
 
 
 @dataclass(frozen=True)
 class Targets:
-    """What the head should say of one frame's anchors.
+    """Training targets of one frame's anchors.
 
     Attributes:
         state: (H, W, A) int8: 1 positive, 0 negative, -1 takes no part in the loss.
@@ -65,7 +65,7 @@ def assign_targets(
 
     Args:
         anchors: (H, W, A, 7), class-major along A, see `detection.anchors.make_anchors`.
-        classes: what anchor 2c and 2c + 1 look for.
+        classes: class c is that of anchors 2c and 2c + 1.
         boxes: (N, 7) labelled boxes.
         labels: (N,) index into `classes`, or IGNORED.
         assigner: which of both.
@@ -83,7 +83,7 @@ def assign_targets(
 
 
 class _Matches(NamedTuple):
-    """`state` without regard to IGNORED boxes, `positives` and `matched` of `Targets`."""
+    """`state`, `positives` and `matched` of `Targets`, without regard to IGNORED boxes."""
 
     state: NDArray[np.int8]
     positives: NDArray[np.int64]
@@ -138,14 +138,14 @@ def _match_nearest(
 
 
 class _Claims(NamedTuple):
-    """Anchors that are to find a box, by ATSS."""
+    """Anchors matched with a box by ATSS."""
 
     places: NDArray[np.int64]
     """(n,) flat indices into (H, W, A)."""
     claimants: NDArray[np.int64]
     """(n,) row of the box."""
     weights: NDArray[np.float64]
-    """(n,) of several boxes that claim an anchor the one with the greatest weight has it."""
+    """(n,) weights; of several boxes that match an anchor, the one with the greatest weight has it."""
 
 
 def _claims(anchors: NDArray[np.float32], box: NDArray[np.float32], label: int, box_index: int) -> _Claims:
@@ -164,7 +164,7 @@ def _claims(anchors: NDArray[np.float32], box: NDArray[np.float32], label: int, 
 def _nearest_cells(
     anchors: NDArray[np.float32], box: NDArray[np.float32]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Row and column of the cells whose centers are nearest to that of `box`, (9,) each; of equally near the first."""
+    """Return row and column of the cells nearest to the center of `box`, (9,) each; of equally near ones the first."""
     dx, dy = (
         np.abs(places.astype(np.float64) - center)
         for places, center in ((anchors[0, :, 0, 0], box[0]), (anchors[:, 0, 0, 1], box[1]))
@@ -179,7 +179,7 @@ def _nearest_cells(
 def _ignored(
     anchors: NDArray[np.float32], classes: Sequence[ClassSpec], boxes: NDArray[np.float32]
 ) -> NDArray[np.bool_]:
-    """Where anchors (H, W, A) overlap one of `boxes`, which are IGNORED, by the `negative_iou` of their class."""
+    """Return a mask of anchors (H, W, A) that overlap one of the IGNORED `boxes` by their class's `negative_iou`."""
     ignored = np.zeros(anchors.shape[:3], dtype=bool)
     for box in boxes:
         for class_index, spec in enumerate(classes):
@@ -191,7 +191,7 @@ def _ignored(
 def _overlaps_nearby(
     anchors: NDArray[np.float32], box: NDArray[np.float32], spec: ClassSpec, class_index: int
 ) -> tuple[tuple[slice, slice, slice], NDArray[np.float32]]:
-    """The part of the anchor map that `_window` names, and how much its anchors overlap `box`."""
+    """Return the part of the anchor map that `_window` selects, and the overlaps of its anchors with `box`."""
     window = _window(anchors, box, spec, class_index)
     near = anchors[window]
     return window, aligned_bev_iou(near.reshape(-1, 7), box[None]).reshape(near.shape[:3])
@@ -205,7 +205,7 @@ def _anchors_of(class_index: int) -> slice:
 def _window(
     anchors: NDArray[np.float32], box: NDArray[np.float32], spec: ClassSpec, class_index: int
 ) -> tuple[slice, slice, slice]:
-    """The part of the anchor map that can overlap `box` at all; the rest would only cost time."""
+    """Return the part of the anchor map that can overlap `box`."""
     reach = (max(box[3], box[4]) + max(spec.length_m, spec.width_m)) / 2
     columns = np.searchsorted(anchors[0, :, 0, 0], (box[0] - reach, box[0] + reach))
     rows = np.searchsorted(anchors[:, 0, 0, 1], (box[1] - reach, box[1] + reach))
@@ -241,7 +241,7 @@ def greedy_matches(detections: _Indices, objects: _Indices) -> NDArray[np.bool_]
 
 
 def match_by_overlap(overlap: _Doubles, least: float) -> tuple[_Indices, _Indices]:
-    """Each detection takes the free object that it overlaps most: (D, O) -> (M,) detections, (M,) objects.
+    """Match each detection with the free object that it overlaps most: (D, O) -> (M,) detections, (M,) objects.
 
     Args:
         overlap: intersection over union; detections stand by descending score.
@@ -254,7 +254,7 @@ def match_by_overlap(overlap: _Doubles, least: float) -> tuple[_Indices, _Indice
 
 
 def best_assignments(overlap: _Doubles) -> _Indices:
-    """The one-to-one matching of greatest total overlap, of the first k detections, for every k.
+    """Return the one-to-one matching of greatest total overlap of the first k detections, for every k.
 
     Exact. Detections come one after the other; a new one changes the best matching along a single chain of detections
     that hand their objects on (Hungarian method), and few detections touch more than one object.

@@ -1,4 +1,4 @@
-"""The one place where a model's section of the configuration becomes a network."""
+"""Construction of networks from a model's section of the configuration."""
 
 from typing import assert_never
 
@@ -17,10 +17,10 @@ from asca_pillars.models.two_stage.preparation import cached_preparation
 
 
 def build_model(model: ModelConfig) -> Trainable:
-    """The network that `model` describes, with fresh random weights.
+    """Build the network that `model` describes, with fresh random weights.
 
     Raises:
-        ConfigError: `model` does not say enough about its first stage.
+        ConfigError: `model` lacks properties of its first stage.
     """
     match model:
         case PillarModel():
@@ -34,10 +34,10 @@ def build_model(model: ModelConfig) -> Trainable:
 
 
 def build_preparation(model: ModelConfig, split: LabeledSplit, data: DataConfig) -> Preparation:
-    """What makes batches of the frames of `split` for that network; what is computed once per dataset is computed.
+    """Return the `Preparation` of batches for the network; what is computed once per dataset is computed here.
 
     Raises:
-        AscaError: of what is computed once per dataset.
+        AscaError: what is computed once per dataset cannot be computed or saved.
     """
     match model:
         case PillarModel():

@@ -28,7 +28,7 @@ class Checkpoint(NamedTuple):
     expected_input: ExpectedInput | None = None
 
     def with_model(self, model: ModelConfig) -> "Checkpoint":
-        """The same weights in a network of another `spec`: other ranges, thresholds or post-processing."""
+        """Return the same weights in a network of another `spec`: other ranges, thresholds or post-processing."""
         detector = build_model(model)
         detector.load_state_dict(self.detector.state_dict())
         return self._replace(config=replace(self.config, model=model), detector=detector.eval())

@@ -1,4 +1,4 @@
-"""A checkpoint as it lies on disk: its configuration and weights, before there is a network for them."""
+"""Checkpoint files: configuration and weights, before a network is built."""
 
 import hashlib
 import pickle
@@ -29,7 +29,7 @@ class CheckpointFile(NamedTuple):
     steps: int
     """Optimizer steps behind them."""
     expected_input: ExpectedInput | None
-    """Of the scans that it was trained on; None in checkpoints made before this was measured."""
+    """Statistics of the scans that it was trained on; None in checkpoints made before they were measured."""
 
     def fill(self, network: nn.Module) -> None:
         """Load the weights into the network that they are of.
@@ -81,13 +81,13 @@ def _damaged(path: Path, error: Exception) -> TrainingError:
 
 
 def read_plain(path: Path) -> dict[str, Any]:
-    """The dictionary that a file of `torch.save` holds, weights only: nothing in the file is executed.
+    """Read the dictionary in a file of `torch.save`, weights only: nothing in the file is executed.
 
     Raises:
         ValueError: it holds something else than a dictionary.
         Exception: whatever the damaged bytes happen to trigger in `torch.load`.
     """
-    with warnings.catch_warnings(action="ignore"):  # of pickles that are no checkpoints; the error says so
+    with warnings.catch_warnings(action="ignore"):  # from pickles that are no checkpoints, which raise an error
         content = torch.load(path, map_location="cpu", weights_only=True)
     if not isinstance(content, dict):
         raise ValueError(f"it holds a {type(content).__name__}, where a checkpoint holds a dictionary")
@@ -102,9 +102,9 @@ def _library_of(content: Mapping[str, Any]) -> str | None:
 
 
 def read_failure(error: Exception) -> str:
-    """Why a file of weights was not read, in one line.
+    """Return in one line why a file of weights could not be read.
 
-    The words of torch.load for a pickle that it does not take are left out: they advise to execute what is in it.
+    torch.load's message for a pickle that it refuses is left out: it advises to execute the content.
     """
     if isinstance(error, pickle.UnpicklingError):
         return "it is not plain arrays and settings; nothing in it was executed"
@@ -134,7 +134,7 @@ def save_weights(checkpoint: Path, path: Path) -> None:
 
 
 def weights_sha256(weights: Mapping[str, Tensor]) -> str:
-    """SHA-256 of a network's trained arrays (its `state_dict`, on the CPU): names, shapes, values, sorted by name.
+    """Return the SHA-256 of a network's trained arrays (`state_dict`): names, shapes, values, sorted by name.
 
     It is that of the weights as they are computed with: last.ckpt and weights.ckpt of one run may differ, because the
     latter's were rounded to 16 bits.

@@ -1,4 +1,4 @@
-"""Layers on a map seen from above (SECOND, PointPillars): blocks, their upsamplings, and the head on them."""
+"""Layers on a bird's-eye-view map (SECOND, PointPillars): blocks, their upsamplings, and the head on them."""
 
 import math
 from collections.abc import Iterable, Sequence
@@ -13,7 +13,7 @@ NORM_EPS, NORM_MOMENTUM = 1e-3, 0.01  # as in SECOND and PointPillars
 
 
 def as_map(cells: Tensor) -> Tensor:
-    """A map whose channels lie side by side, as convolutions read it: (B, H, W, C) -> (B, C, H, W).
+    """Permute a channels-last map for convolutions: (B, H, W, C) -> (B, C, H, W).
 
     They lie so in memory after it, too, which suits convolutions; but on a CPU without AVX-512 their gradients then
     take twice the time, and the map is copied.
@@ -25,7 +25,7 @@ def as_map(cells: Tensor) -> Tensor:
 
 
 def convolution_block(in_channels: int, channels: int, convs: int, *, stride: int = 2) -> nn.Sequential:
-    """A 3x3 convolution with this stride and `convs` with stride 1, each with BatchNorm and ReLU.
+    """Build a 3x3 convolution with this stride and `convs` with stride 1, each with BatchNorm and ReLU.
 
     Table 1 of ASCA-PointPillars prints padding 0 for some strided convolutions and yet halves the maps exactly: one
     pixel of zeros is what both need.
@@ -37,7 +37,7 @@ def convolution_block(in_channels: int, channels: int, convs: int, *, stride: in
 
 
 def upsampling(in_channels: int, channels: int, stride: int) -> nn.Sequential:
-    """A transposed convolution whose kernel is its stride, with BatchNorm and ReLU."""
+    """Build a transposed convolution whose kernel is its stride, with BatchNorm and ReLU."""
     return nn.Sequential(
         *_normed(nn.ConvTranspose2d(in_channels, channels, stride, stride=stride, bias=False), channels)
     )
@@ -78,7 +78,7 @@ class MapBackbone(nn.Module):
         self.out_channels = upsample_channels * len(self.blocks)
 
     def forward(self, canvas: Tensor) -> Tensor:
-        """Unitless (B, C, H, W) -> (B, out_channels, h, w) with h = H / head_stride and w = W / head_stride."""
+        """Apply the blocks: unitless (B, C, H, W) -> (B, out_channels, h, w), with h, w = H, W / head_stride."""
         maps, attention = [], self.attention or [nn.Identity()] * len(self.blocks)
         for block, attend, deblock in zip(self.blocks, attention, self.deblocks, strict=True):
             canvas = attend(block(canvas))
@@ -94,7 +94,7 @@ def _normed(convolution: nn.Module, channels: int) -> list[nn.Module]:
     ]
 
 
-POSITIVE_PRIOR = 0.01  # what an untrained head says of every anchor: focal loss starts calm (arXiv 1708.02002, 4.1)
+POSITIVE_PRIOR = 0.01  # initial score of every anchor, which stabilizes focal loss (arXiv 1708.02002, 4.1)
 
 
 class SSDHead(nn.Module):
@@ -113,24 +113,24 @@ class SSDHead(nn.Module):
         nn.init.normal_(self.boxes.weight, std=0.001)
 
     def forward(self, features: Tensor) -> HeadMaps[Tensor]:
-        """(B, C, H, W) -> scores (B, A, H, W), boxes (B, 7A, H, W), directions (B, 2A, H, W).
+        """Apply the head: (B, C, H, W) -> scores (B, A, H, W), boxes (B, 7A, H, W), directions (B, 2A, H, W).
 
         With several scores per anchor there are so many times A of them, those of an anchor side by side.
         """
         return HeadMaps(self.scores(features), self.boxes(features), self.directions(features))
 
     def at_cells(self, features: Tensor) -> HeadMaps[Tensor]:
-        """The same at single cells: (M, C) -> scores (M, A), boxes (M, 7A), directions (M, 2A)."""
+        """Apply the head at single cells: (M, C) -> scores (M, A), boxes (M, 7A), directions (M, 2A)."""
         joined = linear_rows(features, *self.joined())  # one product and one gradient of the features instead of three
         return HeadMaps(*joined.split(self.channels, dim=1))
 
     @property
     def channels(self) -> list[int]:
-        """Of scores, boxes and directions."""
+        """Output channels of scores, boxes and directions."""
         return [part.out_channels for part in (self.scores, self.boxes, self.directions)]
 
     def joined(self) -> tuple[Tensor, Tensor]:
-        """The three convolutions as one product: weight (outputs, C) and bias (outputs,), split by `channels`."""
+        """Return the convolutions as one product: weight (outputs, C) and bias (outputs,), split by `channels`."""
         parts = self.scores, self.boxes, self.directions
         weight = torch.cat([part.weight[:, :, 0, 0] for part in parts])
         return weight, torch.cat([part.bias for part in parts if part.bias is not None])

@@ -20,7 +20,7 @@ from asca_pillars.scans.mounting import Mounting
 
 
 class ScanDetector:
-    """Detect objects in one scan after the other.
+    """Detector of single scans in PyTorch.
 
     Args:
         network: in evaluation mode; its scans are computed where its weights are.
@@ -35,7 +35,7 @@ class ScanDetector:
         self._device = next(network.parameters()).device
 
     def __call__(self, points: NDArray[np.float32]) -> Detections:
-        """(N, 4) x, y, z in metres (LiDAR frame) and reflectance 0..1 -> boxes, best first."""
+        """Detect: (N, 4) x, y, z in metres (LiDAR frame) and reflectance 0..1 -> boxes, best first."""
         if self._to_model is not None:
             points = self._to_model.points(points)
         unlabeled = LabeledFrame("", points, np.empty((0, 7), np.float32), np.empty(0, np.int64))
@@ -49,7 +49,7 @@ class ScanDetector:
 
 
 class OpenedCheckpoint(NamedTuple):
-    """A checkpoint that detects, its configuration, and what a report says about it."""
+    """Opened checkpoint: detector, configuration, and description for a report."""
 
     detector: ScanDetector
     config: Config

@@ -1,10 +1,10 @@
-"""Products over rows whose number changes from batch to batch, and convolutions at active cells alone by rulebooks.
+"""Sparse convolutions by rulebooks, and matrix products over varying numbers of rows.
 
 Features are rows, one for each active cell; a rulebook's entry beyond the last row stands for zeros. Every sum stays
 inside a matrix product or runs in a fixed order, so results do not differ from run to run.
 
-In a lower precision a CPU's product is compiled by oneDNN for each shape that it has not seen: milliseconds, again and
-again where every batch has its own number of rows; a third of a training step. Rows of zeros round it to one of few.
+In a lower precision, oneDNN compiles a CPU's product for each new shape, in milliseconds: a third of a training step
+where every batch has another number of rows. Rows are therefore padded with zeros to one of few numbers.
 """
 
 from collections.abc import Callable, Iterator
@@ -16,19 +16,19 @@ from torch.nn import functional as F  # noqa: N812  (torch's own convention)
 
 
 def rounded_rows(rows: int) -> int:
-    """`rows` or a little more, at most a sixteenth: one of 16 numbers in each octave."""
+    """Return `rows` rounded up by at most a sixteenth, to one of 16 numbers in each octave."""
     step = 1 << max((rows - 1).bit_length() - 5, 0)
     return -(-rows // step) * step
 
 
 def pad_rows(features: Tensor, value: float = 0) -> Tensor:
-    """Rows (N, C) followed by rows of `value`, as many in all as `rounded_rows` says."""
+    """Pad rows (N, C) with rows of `value` to the number that `rounded_rows` gives."""
     missing = rounded_rows(len(features)) - len(features)
     return F.pad(features, (0, 0, 0, missing), value=value) if missing else features
 
 
 def linear_rows(features: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
-    """`torch.nn.functional.linear` of rows, unitless: (N, C) -> (N, outputs)."""
+    """Apply `torch.nn.functional.linear` to rows, unitless: (N, C) -> (N, outputs)."""
     device = features.device.type
     if device != "cpu" or not torch.is_autocast_enabled(device):
         return F.linear(features, weight, bias)
@@ -39,7 +39,7 @@ CHUNK_VALUES = 1 << 20  # gathered at a time: on a CPU they stay in its cache; a
 
 
 def rulebook_conv(features: Tensor, weight: Tensor, table: Tensor, back: Tensor | None = None) -> Tensor:
-    """A convolution without bias at M output cells: (N, C) -> (M, outputs).
+    """Compute a convolution without bias at M output cells: (N, C) -> (M, outputs).
 
     Under autocast it computes in the lower precision, as a convolution would.
 
@@ -79,19 +79,19 @@ class _RulebookConv(torch.autograd.Function):
 
 
 def _by_output(weight: Tensor) -> Tensor:
-    """(outputs, C, *kernel) -> (outputs, K * C), without a copy if channels are last in memory."""
+    """Permute (outputs, C, *kernel) to (outputs, K * C), without a copy if channels are last in memory."""
     return weight.movedim(1, -1).flatten(1)
 
 
 def _gathered_product(features: Tensor, table: Tensor, matrix: Tensor) -> Tensor:
-    """Rows gathered by the table (M, K), side by side, times the matrix (K * C, outputs)."""
+    """Multiply the rows gathered by the table (M, K), side by side, by the matrix (K * C, outputs)."""
     if len(table) == 0:
         return features.new_zeros(0, matrix.shape[1])
     return torch.cat([(gathered @ matrix)[:rows] for rows, gathered in _chunks(features, table)])
 
 
 def _weight_gradient(features: Tensor, table: Tensor, gradient: Tensor) -> Tensor:
-    """(outputs, K * C), summed over chunks in float32 at least."""
+    """Return the gradient of the weight, (outputs, K * C), summed over chunks in float32 at least."""
     total = torch.promote_types(features.dtype, torch.float32)
     matrix = torch.zeros(gradient.shape[1], table.shape[1] * features.shape[1], dtype=total, device=features.device)
     first = 0
@@ -102,7 +102,7 @@ def _weight_gradient(features: Tensor, table: Tensor, gradient: Tensor) -> Tenso
 
 
 def _chunks(features: Tensor, table: Tensor) -> Iterator[tuple[int, Tensor]]:
-    """Chunk by chunk, how many rows it is of, and these gathered (m, K * C), followed by zeros, see `row_product`."""
+    """Yield for each chunk its number of rows, and its gathered rows (m, K * C), followed by zeros."""
     padded = F.pad(features, (0, 0, 0, 1))
     values = table.shape[1] * features.shape[1]
     for part in table.split(rounded_rows(max(CHUNK_VALUES // values, 1))):
@@ -111,5 +111,5 @@ def _chunks(features: Tensor, table: Tensor) -> Iterator[tuple[int, Tensor]]:
 
 
 def at_active_cells(norm: Callable[[Tensor], Tensor], features: Tensor) -> Tensor:
-    """A batch normalization made for maps or volumes, over active cells alone: (M, C) -> (M, C), unitless."""
+    """Apply a batch normalization of maps or volumes to active cells: (M, C) -> (M, C), unitless."""
     return norm(features[:, :, None, None])[:, :, 0, 0]

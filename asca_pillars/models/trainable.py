@@ -16,15 +16,15 @@ class Movable(Protocol):
     """A batch of tensors that can move to a device."""
 
     def to(self, device: Any) -> Self:
-        """The same batch with its tensors on `device`."""
+        """Return the batch with its tensors on `device`."""
         ...
 
 
 class Preparation(Protocol):
-    """Frames to input and targets of a network. Loader processes do it, so it is pickled and holds no weights."""
+    """Conversion of frames to a network's input and targets. Pickled for loader processes, so it holds no weights."""
 
     def prepare(self, frame: LabeledFrame, rng: np.random.Generator | None) -> Any:
-        """One frame, NumPy arrays only.
+        """Prepare one frame, as NumPy arrays only.
 
         Args:
             frame: points and boxes in the LiDAR frame; boxes may lie outside the detector's ranges.
@@ -33,27 +33,27 @@ class Preparation(Protocol):
         ...
 
     def collate(self, frames: Sequence[Any]) -> Movable:
-        """What `prepare` gave for B frames as one batch of tensors."""
+        """Collate the results of `prepare` for B frames into one batch of tensors."""
         ...
 
 
 class Trainable(nn.Module, ABC):
     """A detector that can be trained.
 
-    Outputs are the family's own: what `predict` gives goes to `loss` and to `detect` only.
+    The type of outputs is the family's: the result of `predict` is only passed to `loss` and `detect`.
     """
 
     preparation: Preparation
-    """Prepares its batches."""
+    """Preparation of its batches."""
 
     @abstractmethod
     def predict(self, batch: Any) -> Any:
-        """Outputs of the network for a batch that `preparation.collate` made."""
+        """Return the outputs of the network for a batch that `preparation.collate` made."""
 
     @abstractmethod
     def loss(self, outputs: Any, batch: Any) -> Mapping[str, Tensor]:
-        """Weighted terms of the loss by name, scalars; training minimizes their sum."""
+        """Return the weighted terms of the loss by name, scalars; training minimizes their sum."""
 
     @abstractmethod
     def detect(self, outputs: Any, spec: DetectorSpec) -> list[Detections]:
-        """Detections of each of the B frames, best first, with the thresholds of `spec`."""
+        """Return detections of each of the B frames, best first, with the thresholds of `spec`."""

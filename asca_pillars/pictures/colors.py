@@ -29,33 +29,33 @@ HEIGHT_SPAN_M = 4.0
 
 
 def class_rgb(name: str) -> Rgb:
-    """The color of a class: the same everywhere, whatever other classes there are."""
+    """Return the color of a class: the same everywhere, whatever other classes there are."""
     return CLASS_COLORS.get(name) or OTHER_COLORS[zlib.crc32(name.encode()) % len(OTHER_COLORS)]
 
 
 def class_shares(name: str) -> tuple[float, float, float]:
-    """The color of a class as shares of red, green and blue, 0..1, as WebGL, Foxglove and ROS want it."""
+    """Return the color of a class as shares of red, green and blue, 0..1, as in WebGL, Foxglove and ROS."""
     red, green, blue = class_rgb(name)
     return red / 255, green / 255, blue / 255
 
 
 def color_table(names: Iterable[str]) -> dict[str, list[int]]:
-    """Red, green, blue, 0..255, of each class by its name, as JSON holds them."""
+    """Return red, green, blue, 0..255, of each class by its name, as JSON holds them."""
     return {name: list(class_rgb(name)) for name in names}
 
 
 def height_table() -> dict[str, Any]:
-    """The color ramp of heights as JSON holds it: `ramp`, red, green, blue 0..255, and `span_m`."""
+    """Return the color ramp of heights as JSON holds it: `ramp`, red, green, blue 0..255, and `span_m`."""
     return {"ramp": [list(color) for color in HEIGHT_RAMP], "span_m": HEIGHT_SPAN_M}
 
 
 def ground_height(z_m: NDArray[np.floating]) -> float:
-    """Height (m) at which the color ramp begins: the 10th percentile of the points' (N,); 0 without points."""
+    """Return the height (m) at which the color ramp begins: 10th percentile of the points' (N,); 0 without points."""
     return float(np.percentile(z_m, 10)) if len(z_m) else 0.0
 
 
 def height_rgb(z_m: NDArray[np.floating], ground_m: float) -> NDArray[np.uint8]:
-    """Colors (N, 3), red, green, blue, of points at heights (N,), metres."""
+    """Return colors (N, 3), red, green, blue, of points at heights (N,), metres."""
     shares = np.clip((z_m - ground_m) / HEIGHT_SPAN_M, 0, 1)
     stops = np.linspace(0, 1, len(HEIGHT_RAMP))
     channels = [np.interp(shares, stops, [color[channel] for color in HEIGHT_RAMP]) for channel in range(3)]

@@ -1,4 +1,4 @@
-"""What the pictures are made with: the view from above, text that keeps clear of other text, subpixels."""
+"""Drawing: bird's-eye view, text that does not overlap other text, subpixels."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -15,7 +15,7 @@ Color = tuple[int, int, int]
 
 BACKGROUND: Color = (24, 18, 14)
 OVERSAMPLING = 2
-"""What is seen from above is drawn this much larger and averaged down, which smooths even single points."""
+"""Factor by which bird's-eye views are drawn larger and then averaged down, which smooths even single points."""
 SUBPIXEL_BITS = 4
 LEGEND_PX, LEGEND_ROW_PX = 200, 22
 """Width kept free for the legend, and height of a row, before oversampling."""
@@ -28,7 +28,7 @@ _MAX_ASPECT = 1.1  # height over width of the picture from above
 
 @dataclass(frozen=True)
 class View:
-    """What part of the LiDAR's ground plane a canvas shows, at which scale (pixels of the canvas)."""
+    """Part of the LiDAR's ground plane that a canvas shows, and its scale (pixels of the canvas)."""
 
     x_max_m: float
     y_max_m: float
@@ -38,7 +38,7 @@ class View:
 
     @classmethod
     def around(cls, content_xy: NDArray[np.floating], ranges: Ranges, width_px: int) -> "View":
-        """The part of the ranges that holds the content (N, 2), and the sensor if it is in the range."""
+        """Return the part of the ranges that holds the content (N, 2), and the sensor if it is in the range."""
         low, high = np.array([ranges.x_m, ranges.y_m]).T
         has_sensor = bool((low <= 0).all() and (high >= 0).all())
         if len(content_xy):
@@ -55,11 +55,11 @@ class View:
         return cls(float(high[0]), float(center_y_m + width / px_per_m / 2), float(px_per_m), width, height)
 
     def pixels(self, xy_m: NDArray[np.floating]) -> NDArray[np.float64]:
-        """(..., 2) x, y in metres to (..., 2) column, row."""
+        """Convert (..., 2) x, y in metres to (..., 2) column, row."""
         return (np.array([self.y_max_m, self.x_max_m]) - xy_m[..., ::-1]) * self.px_per_m
 
     def shows(self, pixel: NDArray[np.floating], margin_px: float = 0.0) -> bool:
-        """Whether pixels (..., 2) of column, row all lie inside, at least `margin_px` from the border."""
+        """Return whether pixels (..., 2) of column, row all lie inside, at least `margin_px` from the border."""
         inner = (margin_px <= pixel) & (pixel <= np.array([self.width_px, self.height_px]) - margin_px)
         return bool(inner.all())
 
@@ -73,9 +73,9 @@ class BoxLayer:
     """(N, 7) LiDAR boxes."""
     color: Color
     texts: Sequence[str] = ()
-    """What stands beside each box; nothing if empty."""
+    """Text beside each box; none if empty."""
     thickness_px: int = 4
-    """Of the outline, before the picture is made half as large."""
+    """Width of the outline, before the picture is reduced to half its size."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,21 +89,21 @@ class Trail:
 
 @dataclass
 class Texts:
-    """Text on a canvas that keeps clear of the text put before it."""
+    """Texts on a canvas, placed without overlap."""
 
     canvas: Image
     scale: float
     background: Color | None = BACKGROUND
-    """Behind the text; None: what is there."""
+    """Color behind the text; None leaves the canvas."""
     taken: list[tuple[float, float, float, float]] = field(default_factory=list)
 
     def size(self, text: str) -> tuple[int, int]:
-        """Width and height of a text, pixels."""
+        """Return width and height of a text, pixels."""
         (width, height), _ = cv2.getTextSize(text, _FONT, self.scale, 1)
         return width, height
 
     def reserve(self, x1: float, y1: float, x2: float, y2: float) -> bool:
-        """Take a rectangle, pixels, if it is free; whether it was."""
+        """Reserve a rectangle, pixels, if it is free; return whether it was."""
         if any(x1 < b[2] and b[0] < x2 and y1 < b[3] and b[1] < y2 for b in self.taken):
             return False
         self.taken.append((x1, y1, x2, y2))
@@ -126,7 +126,7 @@ class Texts:
 
 
 def draw_legend(texts: Texts, layers: Sequence[BoxLayer]) -> None:
-    """Name, color and number of boxes of each layer, in the upper left corner of an oversampled canvas."""
+    """Draw name, color and number of boxes of each layer, in the upper left corner of an oversampled canvas."""
     line = LEGEND_ROW_PX * OVERSAMPLING
     for number, layer in enumerate(layers):
         left, base = 16 * OVERSAMPLING, 12 * OVERSAMPLING + (number + 1) * line - line // 4
@@ -150,11 +150,11 @@ def draw_color_bar(texts: Texts) -> None:
 
 
 def mixed(first: Color, second: Color, share: float) -> Color:
-    """The second of two colors by this share, 0..1, in the first."""
+    """Mix two colors, with this share, 0..1, of the second."""
     blue, green, red = (round(a + share * (b - a)) for a, b in zip(first, second, strict=True))
     return blue, green, red
 
 
 def subpixels(pixels: NDArray[np.floating]) -> NDArray[np.int32]:
-    """Pixel coordinates (..., 2) as OpenCV's fixed-point integers, in 1 / 2**SUBPIXEL_BITS pixel."""
+    """Convert pixel coordinates (..., 2) to OpenCV's fixed-point integers, in 1 / 2**SUBPIXEL_BITS pixel."""
     return np.round(np.clip(pixels, -1e6, 1e6) * 2**SUBPIXEL_BITS).astype(np.int32)

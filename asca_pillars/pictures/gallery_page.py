@@ -1,4 +1,4 @@
-"""A page of pictures that sorts: one HTML file beside them, which needs no network and no server."""
+"""Sortable gallery of pictures: one HTML file beside them, which needs no network and no server."""
 
 import html
 import json
@@ -12,11 +12,11 @@ from asca_pillars.pictures.colors import class_rgb
 
 @dataclass(frozen=True)
 class GalleryCard:
-    """One picture and what is said of it."""
+    """One picture and its caption."""
 
     title: str
     picture: PurePath
-    """Relative to the page."""
+    """Path relative to the page."""
     values: Mapping[str, float]
     """Counts and scores by name, by which the page sorts; a card that lacks one, or whose is NaN, comes last."""
     classes: Mapping[str, int] = field(default_factory=dict)
@@ -27,14 +27,14 @@ class GalleryCard:
 def gallery_page(
     title: str, introduction: str, cards: Sequence[GalleryCard], first: str | None, *, end: str = ""
 ) -> str:
-    """The HTML of a page: a grid of pictures, each of which opens in full size.
+    """Return the HTML of a page: a grid of pictures, each of which opens in full size.
 
     Args:
         title: of the page.
         introduction: plain text; empty lines divide paragraphs.
         cards: in the order of their files.
         first: the value that they are sorted by at first, the largest on top; None: as they come.
-        end: what follows the HTML, such as the sentence by which a command recognizes its own page.
+        end: text after the HTML, such as the sentence by which a command recognizes its page.
     """
     names = list(dict.fromkeys(name for card in cards for name in card.values))
     buttons = "".join(_button(name, pressed=name == first) for name in ["order", *names])
@@ -84,7 +84,7 @@ def _number(value: float) -> str:
 
 
 def _text(text: str) -> str:
-    """As HTML, in a text or in an attribute."""
+    """Escape a text for HTML, as content or in an attribute."""
     return html.escape(text, quote=True)
 
 

@@ -54,16 +54,16 @@ class ChaseCamera:
 
     @classmethod
     def behind(cls, ranges: Ranges, ground_m: float, width_px: int) -> "ChaseCamera":
-        """A camera behind the sensor, higher where the detector looks around; `width_px` wide."""
+        """Return a camera behind the sensor, higher where the detector looks around; `width_px` wide."""
         height_px = 2 * round(width_px * ASPECT / 2)
         if ranges.x_m[0] < -10:
             return cls((-36.0, 0.0, ground_m + 20.0), (9.0, 0.0, ground_m), width_px, height_px)
         return cls((-17.0, 0.0, ground_m + 9.0), (15.0, 0.0, ground_m + 0.6), width_px, height_px)
 
     def project(self, places_m: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """(..., 3) x, y, z in metres to pixels (..., 2), column and row, and depths (...,) in metres.
+        """Project (..., 3) x, y, z in metres to pixels (..., 2), column and row, and depths (...,) in metres.
 
-        Pixels of what is nearer than half a metre, or behind, mean nothing.
+        Pixels of points nearer than half a metre, or behind the camera, are meaningless.
         """
         seen = (np.asarray(places_m, np.float64) - self.eye_m) @ self._axes().T
         depth = seen[..., 2]
@@ -71,7 +71,7 @@ class ChaseCamera:
         return pixels + np.array([self.width_px, self.height_px]) / 2, depth
 
     def cut(self, starts_m: NDArray[np.floating], ends_m: NDArray[np.floating]) -> NDArray[np.float64]:
-        """Lines from (N, 3) to (N, 3), metres, as pixels (N, 2, 2); cut where they pass the camera, NaN behind it."""
+        """Project lines from (N, 3) to (N, 3), metres, to pixels (N, 2, 2), clipped at the camera; NaN behind it."""
         ends = np.stack([starts_m, ends_m], axis=1).astype(np.float64)
         depth = (ends - self.eye_m) @ self._axes()[2] - _NEAR_M
         passes = (depth < 0).any(axis=1) & (depth >= 0).any(axis=1)
@@ -87,7 +87,7 @@ class ChaseCamera:
         return self.width_px / 2 / math.tan(_FIELD_OF_VIEW_RAD / 2)
 
     def _axes(self) -> NDArray[np.float64]:
-        """Rows: to the right, down, ahead."""
+        """Return the camera's axes as rows: right, down, ahead."""
         ahead = np.subtract(self.target_m, self.eye_m)
         ahead /= np.linalg.norm(ahead)
         right = np.array([ahead[1], -ahead[0], 0.0]) / math.hypot(ahead[0], ahead[1])
@@ -103,7 +103,7 @@ def draw_chase(
     trails: Sequence[Trail] = (),
     ground_m: float | None = None,
 ) -> Image:
-    """A scan and boxes in 3D, (9/16 width_px, width_px, 3) BGR: points by height, boxes as wireframes.
+    """Draw a scan and boxes in 3D, (9/16 width_px, width_px, 3) BGR: points by height, boxes as wireframes.
 
     Args:
         points: (N, >=3), metres, level LiDAR frame. Those in a box have the color of the box.
@@ -111,7 +111,7 @@ def draw_chase(
         ranges: where the detector looked; they choose the camera.
         width_px: of the picture.
         trails: where boxes were before.
-        ground_m: z of the ground; None: as the points say.
+        ground_m: z of the ground; None: estimated from the points.
     """
     places: NDArray[np.float64] = np.asarray(points)[:, :3].astype(np.float64)
     points = places = places[np.isfinite(places).all(axis=1)]
@@ -135,7 +135,7 @@ def draw_chase(
 
 
 def _sky(camera: ChaseCamera) -> Image:
-    """The empty picture: dark below, a haze at the horizon, darker again above."""
+    """Draw the empty picture: dark below, a haze at the horizon, darker again above."""
     far = np.add(camera.eye_m, [1e6, 0, 0])
     far[2] = camera.eye_m[2]
     horizon = camera.project(far)[0][1]
@@ -149,7 +149,7 @@ def _sky(camera: ChaseCamera) -> Image:
 
 
 def _draw_points(canvas: Image, camera: ChaseCamera, points: NDArray[np.float64], colors: NDArray[np.float64]) -> None:
-    """Far ones first, each as a square whose size falls with its distance."""
+    """Draw points, far ones first, each as a square whose size falls with its distance."""
     pixels, depth = camera.project(points)
     inside = (depth > _NEAR_M) & (pixels >= 0).all(axis=1) & (pixels < (camera.width_px, camera.height_px)).all(axis=1)
     far_first = np.flatnonzero(inside)[np.argsort(-depth[inside], kind="stable")]
@@ -170,7 +170,7 @@ def _draw_points(canvas: Image, camera: ChaseCamera, points: NDArray[np.float64]
 
 
 def _draw_rings(canvas: Image, camera: ChaseCamera, ground_m: float, reach_m: float) -> None:
-    """Circles of equal distance to the sensor on the ground, with their radius beside the way ahead."""
+    """Draw circles of equal distance to the sensor on the ground, with their radius beside the way ahead."""
     angles = np.radians(np.arange(0, 361, 2))
     texts = Texts(canvas, 0.34 * OVERSAMPLING, background=None)
     for radius_m in range(10, math.ceil(reach_m / 10) * 10 + 1, 10):
@@ -188,7 +188,7 @@ def _draw_rings(canvas: Image, camera: ChaseCamera, ground_m: float, reach_m: fl
 
 
 def _draw_ego(texts: Texts, camera: ChaseCamera, ground_m: float) -> None:
-    """The sensor as an arrow, which no text is to cover."""
+    """Draw the sensor as an arrow, which no text covers."""
     pixels, depth = camera.project(np.column_stack([_EGO_M, np.full(len(_EGO_M), ground_m + 0.05)]))
     if (depth > _NEAR_M).all():
         cv2.fillPoly(texts.canvas, [subpixels(pixels)], _WHITE, cv2.LINE_AA, SUBPIXEL_BITS)
@@ -196,7 +196,7 @@ def _draw_ego(texts: Texts, camera: ChaseCamera, ground_m: float) -> None:
 
 
 def _draw_trail(canvas: Image, camera: ChaseCamera, trail: Trail) -> None:
-    """From its oldest place, faint, to its newest."""
+    """Draw a trail from its oldest place, faint, to its newest."""
     count = len(trail.places_m)
     for number, line in enumerate(camera.cut(trail.places_m[:-1], trail.places_m[1:]), start=1):
         if np.isfinite(line).all():
@@ -205,7 +205,7 @@ def _draw_trail(canvas: Image, camera: ChaseCamera, trail: Trail) -> None:
 
 
 def _draw_boxes(texts: Texts, camera: ChaseCamera, layers: Sequence[BoxLayer]) -> None:
-    """Far ones first; texts last, those of near boxes before others."""
+    """Draw boxes, far ones first, then texts, those of near boxes before others."""
     each = [
         (box, layer, layer.texts[row] if layer.texts else "")
         for layer in layers

@@ -1,4 +1,4 @@
-"""Training frames as pictures: what a network is shown, with the boxes that it is to find."""
+"""Pictures of training frames: the network's input with the labelled boxes."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -22,7 +22,7 @@ _IGNORED_COLOR = (150, 150, 150)
 
 
 def draw_training_frames(folder: Path, frames: TrainingFrames, count: int) -> list[str]:
-    """Write NAME.png of up to `count` frames, evenly spaced, as the first epoch has them; a sentence about each.
+    """Write NAME.png of up to `count` frames, evenly spaced, as in the first epoch; return a sentence about each.
 
     Raises:
         DatasetError, ScanError: a frame cannot be read.
@@ -41,7 +41,7 @@ def draw_training_frames(folder: Path, frames: TrainingFrames, count: int) -> li
 
 
 def draw_training_frame(frame: LabeledFrame, frames: TrainingFrames) -> Image:
-    """One frame from above, (H, W, 3) BGR: boxes in their class's color, those that are ignored gray."""
+    """Draw one frame from above, (H, W, 3) BGR: boxes in their class's color, ignored ones gray."""
     layers = [
         BoxLayer(name, frame.boxes[frame.labels == label], class_color(name))
         for label, name in enumerate(frames.spec.class_names)
@@ -53,7 +53,7 @@ def draw_training_frame(frame: LabeledFrame, frames: TrainingFrames) -> Image:
 
 
 def _moved(motion: Motion) -> str:
-    """How augmentation moved the frame as a whole, in words."""
+    """Return in words how augmentation moved the frame as a whole."""
     changes = ["mirrored"] if motion.flipped else []
     if motion.rotation_rad:
         changes.append(f"turned by {np.degrees(motion.rotation_rad):.0f} degrees")
@@ -65,12 +65,12 @@ def _moved(motion: Motion) -> str:
 
 
 def require_replaceable_pictures(out: Path) -> None:
-    """OutputError where `out` holds something else than pictures of an earlier run."""
+    """Raise OutputError if `out` holds something other than pictures of an earlier run."""
     require_replaceable(out, *PICTURES_FOLDER)
 
 
 def draw_frames(data: Path, split: str, config: Config, count: int, out: Path) -> list[str]:
-    """Write pictures of `count` frames of the list `split` to `out`, in place of an earlier run's; a line for each.
+    """Write pictures of `count` frames of the list `split` to `out`, replacing earlier ones; return a line for each.
 
     Raises:
         OutputError: `out` holds something else.

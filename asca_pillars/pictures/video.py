@@ -32,16 +32,16 @@ SUFFIX = ".mp4"
 MADE_BY = "asca-pillars video"
 WIDTH_PX: dict[str, int] = {"above": 900, "chase": 1280}
 TRAIL_S = 3.0
-"""A trail is as long as the way of so many seconds."""
+"""Length of a trail in seconds."""
 _HEAD_BYTES = 16 << 20  # the file's index, with the comment, stands before the pictures
 _GRAY = (190, 180, 172)
 
 
 def find_encoder() -> str:
-    """The program that encodes videos.
+    """Return the program that encodes videos.
 
     Raises:
-        AscaError: there is none; says how to get it.
+        AscaError: there is none; the message says how to install it.
     """
     if importlib.util.find_spec("imageio_ffmpeg") is not None:
         import imageio_ffmpeg
@@ -158,13 +158,13 @@ class BoxVideo:
         track_ids: NDArray[np.integer] | None = None,
         pose: NDArray[np.float64] | None = None,
     ) -> None:
-        """One scan.
+        """Add one scan.
 
         Args:
             points: (N, >=3) metres, in the scan's frame.
             detections: found in it, in the same frame.
             time_s: of the scan.
-            track_ids: (M,) the identity of each box: written beside it, and it gets a trail; None: scores.
+            track_ids: (M,) identity of each box, drawn beside it with a trail; None: scores are drawn.
             pose: 4x4, from the scan to a frame that stands still; None: trails show how things moved about the sensor.
         """
         self._file.write(self.draw(points, detections, time_s, track_ids, pose))
@@ -177,7 +177,7 @@ class BoxVideo:
         track_ids: NDArray[np.integer] | None = None,
         pose: NDArray[np.float64] | None = None,
     ) -> Image:
-        """The picture that `add` adds, (H, W, 3) BGR."""
+        """Return the picture that `add` adds, (H, W, 3) BGR."""
         boxes: NDArray[np.floating] = detections.boxes
         trails, texts = [], None
         if track_ids is not None:
@@ -203,7 +203,7 @@ class BoxVideo:
     def _extend(
         self, detections: Detections, track_ids: NDArray[np.integer], time_s: float, pose: NDArray[np.float64]
     ) -> list[Trail]:
-        """Add the places of the boxes to their trails; the trails of these boxes in the frame of the picture."""
+        """Extend the boxes' trails by their places; return the trails of these boxes in the picture's frame."""
         boxes = detections.boxes.astype(np.float64)
         floors = np.column_stack([boxes[:, :2], boxes[:, 2] - boxes[:, 5] / 2])
         here = np.linalg.inv(pose)
@@ -221,6 +221,6 @@ class BoxVideo:
 
 
 def _whole(ranges: Ranges) -> NDArray[np.float64]:
-    """A box (1, 7) as large as the ranges: pictures show them all, and so have one size."""
+    """Return a box (1, 7) as large as the ranges, so that all pictures have the same extent and size."""
     (x_min, x_max), (y_min, y_max), _ = ranges
     return np.array([[(x_min + x_max) / 2, (y_min + y_max) / 2, 0, x_max - x_min, y_max - y_min, 1, 0]])

@@ -43,13 +43,13 @@ _RING_TEXT_DEG = (-40, -30, 40, 30, 0, -135, 135, 180)
 
 
 def class_color(name: str) -> Color:
-    """The color of a class as OpenCV has it: blue, green, red, 0..255."""
+    """Return the color of a class in OpenCV's order: blue, green, red, 0..255."""
     red, green, blue = class_rgb(name)
     return blue, green, red
 
 
 def read_image(path: Path) -> Image | None:
-    """The image (H, W, 3), blue, green, red, of a file; None if there is none or it cannot be decoded."""
+    """Read an image file (H, W, 3), blue, green, red; None if it is missing or cannot be decoded."""
     image = cv2.imread(str(path)) if path.is_file() else None
     return None if image is None else image.astype(np.uint8, copy=False)
 
@@ -61,7 +61,7 @@ def write_png(path: str | Path, image: Image) -> None:
 
 
 def png_bytes(image: Image) -> bytes:
-    """An image (H, W, 3), blue, green, red, as the bytes of a PNG file that says in its field Software who wrote it."""
+    """Encode an image (H, W, 3), blue, green, red, as PNG bytes with its origin in the field Software."""
     content = cv2.imencode(".png", image)[1].tobytes()
     text = b"tEXtSoftware\0" + PICTURE_SOFTWARE.encode()
     chunk = struct.pack(f">I{len(text)}sI", len(text) - 4, text, zlib.crc32(text))
@@ -69,7 +69,7 @@ def png_bytes(image: Image) -> bytes:
 
 
 class Picture(np.ndarray[Any, np.dtype[np.uint8]]):
-    """An image array (H, W, 3), blue, green, red, that a notebook shows as what it is."""
+    """An image array (H, W, 3), blue, green, red, that a notebook shows as a picture."""
 
     def _repr_png_(self) -> bytes | None:
         return png_bytes(self) if self.ndim == 3 and self.dtype == np.uint8 else None
@@ -83,7 +83,7 @@ def draw_bev(
     labels: NDArray[np.floating] | None = None,
     width_px: int = 1000,
 ) -> Image:
-    """A scan from above: (H, width_px, 3), the LiDAR's x upwards and y to the left.
+    """Draw a scan from above: (H, width_px, 3), the LiDAR's x upwards and y to the left.
 
     Args:
         points: (N, >=3) metres; those in the x and y range are drawn, the higher the brighter.
@@ -98,7 +98,7 @@ def draw_bev(
 def class_layers(
     detections: Detections | None, labels: NDArray[np.floating] | None = None, texts: Sequence[str] | None = None
 ) -> list[BoxLayer]:
-    """A layer for each class, in its color, and one for ground truth (M, 7) if there is any.
+    """Return a layer for each class, in its color, and one for ground truth (M, 7) if there is any.
 
     `texts` stand beside the detections, in their order; None for the scores.
     """
@@ -124,11 +124,11 @@ def draw_layers(
     trails: Sequence[Trail] = (),
     ground_m: float | None = None,
 ) -> Image:
-    """A scan and boxes from above, as `draw_bev`; the first layer is on top and first in the legend.
+    """Draw a scan and boxes from above, as `draw_bev`; the first layer is on top and first in the legend.
 
     Points are (N, >=3), metres, LiDAR frame; the picture is (height, width_px, 3), BGR. With the same boxes (K, 7) as
     `room_for` several pictures of a scan show the same part of it, whatever is drawn in each. `trails` are where boxes
-    were before; colors begin at `ground_m`, or where the points say.
+    were before; colors begin at `ground_m`, or at a height estimated from the points.
     """
     points = points[_in_range(points, ranges)]
     outlines = [footprints(np.asarray(layer.boxes, dtype=np.float64).reshape(-1, 7)) for layer in layers]
@@ -166,9 +166,9 @@ def draw_on_image(
     *,
     colors: Sequence[Color] | None = None,
 ) -> Image:
-    """A copy of a camera image (H, W, 3) with LiDAR boxes (N, 7) as wireframes, their front faces tinted.
+    """Draw LiDAR boxes (N, 7) on a copy of a camera image (H, W, 3) as wireframes with tinted front faces.
 
-    `scores` is None for ground truth, `colors` for those of the classes. What lies behind the camera is cut off.
+    `scores` is None for ground truth, `colors` for those of the classes. Lines behind the camera are cut off.
     """
     colors = [class_color(name) for name in names] if colors is None else colors
     canvas = image.copy()
@@ -218,7 +218,7 @@ def _draw_points(canvas: Image, view: View, points: NDArray[np.floating], ground
 
 
 def _draw_rings(texts: Texts, view: View, legend_rows: int) -> None:
-    """Circles of equal distance to the sensor, with texts beside the legend's place, and the sensor as an arrow."""
+    """Draw circles of equal distance to the sensor, their texts beside the legend, and the sensor as an arrow."""
     legend = np.array([LEGEND_PX, LEGEND_ROW_PX * (legend_rows + 1)]) * OVERSAMPLING
     reach_m = math.hypot(view.x_max_m, max(abs(view.y_max_m), abs(view.y_max_m - view.width_px / view.px_per_m)))
     step_m = 10 if reach_m < 100 else 20
@@ -238,7 +238,7 @@ def _draw_rings(texts: Texts, view: View, legend_rows: int) -> None:
 
 
 def _draw_trail(canvas: Image, view: View, trail: Trail) -> None:
-    """From its oldest place, faint, to its newest."""
+    """Draw a trail from its oldest place, faint, to its newest."""
     pixels = view.pixels(trail.places_m[:, :2])
     for number in range(1, len(pixels)):
         color = mixed(BACKGROUND, trail.color, 0.15 + 0.85 * number / len(pixels))

@@ -1,4 +1,4 @@
-"""What happens around the steps of a run: progress, Ctrl-C, the average of the weights."""
+"""Callbacks of a run: progress, Ctrl-C, the average of the weights."""
 
 import contextlib
 import signal
@@ -20,11 +20,11 @@ _SIGNALS = (signal.SIGINT, signal.SIGTERM)  # Ctrl-C; what `kill`, systemd and b
 
 
 class TrainingInterruptedError(TrainingError):
-    """Asked to stop: the run is saved and can go on."""
+    """A stop was requested; the run is saved and can be resumed."""
 
 
 class SaveOnInterrupt(Checkpoint):
-    """The first Ctrl-C or SIGTERM waits for the step to end, saves, and stops; the second one stops at once.
+    """Saves after the current step on the first Ctrl-C or SIGTERM, and stops; the second one stops at once.
 
     To Lightning alone SIGTERM is the end of a run that went well.
 
@@ -117,24 +117,24 @@ class RunProgress(RankProgress):
         self._start("Checking validation")
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Know the length of the run."""
+        """Set the length of the run."""
         total = (trainer.max_epochs or 0) * pl_module.steps_per_epoch()  # type: ignore[operator]
         self._start("Starting")
         self._bar.update(self._task, total=total, completed=trainer.global_step)
 
     def on_train_epoch_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Say which epoch it is, counted from one."""
+        """Show the epoch, counted from one."""
         self._bar.update(self._task, description=f"Epoch {trainer.current_epoch + 1}/{trainer.max_epochs}")
 
     def on_train_batch_end(self, trainer: L.Trainer, pl_module: L.LightningModule, *_: Any) -> None:
-        """One step more."""
+        """Advance by one step."""
         loss = trainer.progress_bar_metrics.get("loss")
         self._bar.update(
             self._task, completed=trainer.global_step, loss="" if loss is None else f"loss {float(loss):.3f}"
         )
 
     def on_validation_batch_end(self, trainer: L.Trainer, pl_module: L.LightningModule, *arguments: Any) -> None:
-        """How far a validation is stands beside the epoch."""
+        """Show the progress of the validation beside the epoch."""
         if not trainer.sanity_checking:
             batches = sum(int(count) for count in trainer.num_val_batches)
             done = f"validation {arguments[2] + 1}/{batches}"
@@ -149,7 +149,7 @@ class RunProgress(RankProgress):
         self._bar.stop()
 
     def print(self, *args: Any, **_: Any) -> None:
-        """A line above the bar."""
+        """Print a line above the bar."""
         if self._enabled:
             self._bar.console.print(" ".join(map(str, args)), markup=False, highlight=False, soft_wrap=True)
 
@@ -172,17 +172,17 @@ class StepProgress(RankProgress):
         self._progress, self._remark, self._total = progress, remark, 0
 
     def print(self, *args: Any, **_: Any) -> None:
-        """Pass a line on."""
+        """Pass a line to `remark`."""
         if self._enabled:
             self._remark(" ".join(map(str, args)))
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Know the length of the run."""
+        """Set the length of the run."""
         self._total = (trainer.max_epochs or 0) * pl_module.steps_per_epoch()  # type: ignore[operator]
         self._tell(trainer)
 
     def on_train_batch_end(self, trainer: L.Trainer, pl_module: L.LightningModule, *_: Any) -> None:
-        """One step more."""
+        """Advance by one step."""
         self._tell(trainer)
 
     def _tell(self, trainer: L.Trainer) -> None:
@@ -191,16 +191,15 @@ class StepProgress(RankProgress):
 
 
 def weight_average(decay: float) -> WeightAveraging:
-    """Exponential moving average of weights and normalization statistics, for validation and checkpoints.
+    """Return the exponential moving average of weights and normalization statistics, for validation and checkpoints.
 
-    It forgets faster at first: after n steps the decay is at most (1 + n) / (10 + n), so that random weights are gone
-    from it in short runs, too.
+    After n steps the decay is at most (1 + n) / (10 + n), so that random weights are forgotten in short runs, too.
     """
 
     def average(averaged: Tensor, current: Tensor, steps: Tensor | int) -> Tensor:
         kept = min(decay, float((1 + steps) / (10 + steps)))
         if not averaged.is_floating_point():  # batches that a normalization has counted
             return current
-        return averaged + (current - averaged) * (1 - kept)  # what does not move stays bit for bit
+        return averaged + (current - averaged) * (1 - kept)  # constant values stay bit for bit
 
     return WeightAveraging(avg_fn=average)

@@ -23,7 +23,7 @@ from asca_pillars.models.checkpoint_file import read_failure, read_plain
 
 LAST, PREVIOUS, BEST = "last.ckpt", "previous.ckpt", "best.ckpt"
 _UNREADABLE = (OSError, RuntimeError, ValueError, EOFError, KeyError, pickle.UnpicklingError, zipfile.BadZipFile)
-_OTHERWISE_FILLED = (AttributeError, TypeError)  # of a dictionary whose values are of other types
+_OTHERWISE_FILLED = (AttributeError, TypeError)  # from a dictionary with values of other types
 _OF_A_RUN = {
     "state_dict": dict,
     "optimizer_states": list,
@@ -34,7 +34,7 @@ _OF_A_RUN = {
     "global_step": int,
     "pytorch-lightning_version": str,
 }
-"""What a run goes on from; weights.ckpt has no more than the weights."""
+"""Entries that a run resumes from; weights.ckpt holds only the weights."""
 _WEIGHTS_ALONE = "holds weights alone, not the state of a run (weights.ckpt is such a file)"
 
 
@@ -53,7 +53,7 @@ class AtomicCheckpointIO(TorchCheckpointIO):
         """Write `checkpoint` to `path`."""
         path = Path(path)
         with atomic_path(path) as temporary:
-            with temporary.open("wb") as file:  # of a path torch's error is no OSError where the disk is full
+            with temporary.open("wb") as file:  # given a path, torch raises no OSError on a full disk
                 torch.save(checkpoint, file)
             if path.name == LAST:
                 if self.keep_last and path.exists():
@@ -73,7 +73,7 @@ class BestCheckpoint(ModelCheckpoint):
         super().__init__(folder, filename="best", save_top_k=1, enable_version_counter=False, monitor="val/loss")
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Know the loss of the best.ckpt that is there: the last checkpoint may be from before its validation."""
+        """Read the loss of the existing best.ckpt: the last checkpoint may be from before its validation."""
         super().on_train_start(trainer, pl_module)
         path = Path(str(self.dirpath)) / BEST
         if trainer.global_step and path.exists():
@@ -109,7 +109,7 @@ class LastCheckpoint(Checkpoint):
 
 
 def checkpoint_to_resume(folder: Path, model: ModelConfig) -> tuple[Path | None, str | None]:
-    """The newest checkpoint that a run can go on from, or None in a new run; and what is wrong with a newer one.
+    """Return the newest checkpoint to resume from, None in a new run; and what is wrong with a newer one.
 
     Args:
         folder: of the run's checkpoints.
@@ -137,7 +137,7 @@ def checkpoint_to_resume(folder: Path, model: ModelConfig) -> tuple[Path | None,
 
 
 def _why_unusable(path: Path, model: ModelConfig) -> str | None:
-    """Why a run of this model cannot go on from the checkpoint; None if it can."""
+    """Return why a run of this model cannot resume from the checkpoint; None if it can."""
     try:
         content = read_plain(path)
     except _UNREADABLE as error:
@@ -157,7 +157,7 @@ def _why_unusable(path: Path, model: ModelConfig) -> str | None:
 
 
 def steps_of(checkpoint: Path | None) -> int:
-    """Optimizer steps of the run that a checkpoint, which can be read, is of; 0 without one."""
+    """Return the optimizer steps of a readable checkpoint; 0 without one."""
     if checkpoint is None:
         return 0
     return int(read_plain(checkpoint)["global_step"])
@@ -167,9 +167,9 @@ _FIRST_STAGE = tuple(f"network.{part}." for part in PvRcnnModel.FIRST_STAGE)
 
 
 def initial_weights(config: Config, init: Path | None) -> dict[str, Any]:
-    """What a new run of `config` takes from `init`, by the names of `state_dict`; the rest starts at random.
+    """Return the weights that a new run of `config` takes from `init`, as in `state_dict`; others start at random.
 
-    All weights, but where `model.train_first_stage` is false, those of the first stage alone.
+    These are all weights, or where `model.train_first_stage` is false, those of the first stage.
 
     Args:
         config: of the run.

@@ -48,7 +48,7 @@ class Batch:
 
 @dataclass(frozen=True)
 class Collate:
-    """Samples to a `Batch`; an object, because loader processes pickle it.
+    """Collate function that makes a `Batch` of samples; an object, because loader processes pickle it.
 
     An error in the place of a sample stands for the whole batch: torch wraps what a loader process raises into the
     text of its traceback, and the loop is to raise the one line itself.
@@ -57,7 +57,7 @@ class Collate:
     preparation: Preparation
 
     def __call__(self, samples: Sequence[Sample | AscaError]) -> Batch | AscaError:
-        """Make a batch, or give the first error."""
+        """Make a batch, or return the first error."""
         good = []
         for sample in samples:
             if isinstance(sample, AscaError):
@@ -74,8 +74,8 @@ class Collate:
 class LabeledDataset(Dataset[Sample | AscaError]):
     """Frames as samples for one family of detectors.
 
-    What a sample holds does not depend on the number of workers or on what was drawn before it: a resumed run sees what
-    an unbroken one would have seen. An index is therefore a pair (epoch, frame number), see `EpochSampler`.
+    A sample does not depend on the number of workers or on samples before it, so that a resumed run gets the same as an
+    uninterrupted one. An index is therefore a pair (epoch, frame number), see `EpochSampler`.
 
     Args:
         frames: read and augmented.
@@ -90,7 +90,7 @@ class LabeledDataset(Dataset[Sample | AscaError]):
         return len(self.frame_ids)
 
     def __getitem__(self, index: tuple[int, int]) -> Sample | AscaError:
-        """The sample (epoch, frame number), or what is wrong with the files of that frame."""
+        """Return the sample (epoch, frame number), or the error in the frame's files."""
         try:
             return self.sample(*index)
         except AscaError as error:
@@ -99,7 +99,7 @@ class LabeledDataset(Dataset[Sample | AscaError]):
             return WorkerError(f"frame {self.frame_ids[index[1]]} cannot be loaded ({error or type(error).__name__})")
 
     def sample(self, epoch: int, number: int) -> Sample:
-        """One sample.
+        """Read and prepare one sample.
 
         Raises:
             DatasetError, ScanError: a file of the frame is missing or damaged.
@@ -109,7 +109,7 @@ class LabeledDataset(Dataset[Sample | AscaError]):
 
 
 def open_dataset(root: str | Path, config: Config, *, training: bool) -> LabeledDataset:
-    """The training or the validation samples that `config` asks for.
+    """Open the training or the validation samples of `config`.
 
     Raises:
         DatasetError: as `open_frames`.

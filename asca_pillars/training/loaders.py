@@ -1,4 +1,4 @@
-"""Training and validation batches, loaded by processes of their own."""
+"""Training and validation batches from loader processes."""
 
 import atexit
 import contextlib
@@ -19,7 +19,7 @@ from asca_pillars.training.dataset import Collate, LabeledDataset, open_dataset
 from asca_pillars.training.shared_batches import ShareCollated, loader_context, start_loader_process
 
 LOOK_AGAIN_S = 5
-"""Seconds without a batch after which the loop looks whether all processes live."""
+"""Seconds without a batch after which the loop checks that all processes live."""
 MOST_LOOKS = 180
 """Looks without a batch after which it gives up: a quarter of an hour, in which the run was not suspended."""
 _REMEDY = (
@@ -34,7 +34,7 @@ class BatchLoader(DataLoader[Any]):
     _processes: frozenset[Any] = frozenset()
 
     def __iter__(self) -> Iterator[Any]:  # type: ignore[override]
-        """The batches.
+        """Yield the batches.
 
         Raises:
             WorkerError: a process has ended, cannot be started or cannot send a batch, or there is none for too long.
@@ -52,7 +52,7 @@ class BatchLoader(DataLoader[Any]):
                 return
             except (OSError, EOFError, RuntimeError) as error:
                 text = " ".join(str(error).split())
-                if text.startswith("Caught "):  # as torch begins what the work in a process raised
+                if text.startswith("Caught "):  # torch's prefix for errors of a loader process
                     raise
                 late = text.startswith("DataLoader timed out")
                 looks += 1
@@ -67,7 +67,7 @@ class BatchLoader(DataLoader[Any]):
             yield batch
 
     def _start(self) -> Iterator[Any]:
-        """Batches of one epoch; notes the processes that the first one starts."""
+        """Yield batches of one epoch; notes the processes that the first one starts."""
         # torch's loader leaves a traceback where it gets no lock; here are as many as its queues have, and some more.
         _ = [loader_context().Lock() for _ in range(4 * self.num_workers + 8)]
         others = set(multiprocessing.active_children())
@@ -98,11 +98,11 @@ class DetectionData(L.LightningDataModule):
             frames.split.require_files()
 
     def train_dataloader(self) -> DataLoader[Any]:
-        """Shuffled batches, from the step on at which the trainer stands."""
+        """Return shuffled batches, beginning at the trainer's step."""
         return self._loader(self.training_set, lambda: self.trainer.global_step if self.trainer else 0)
 
     def val_dataloader(self) -> DataLoader[Any]:
-        """All validation frames in order."""
+        """Return batches of all validation frames in order."""
         return self._loader(self.validation_set, None)
 
     def _loader(self, frames: LabeledDataset, step: Callable[[], int] | None) -> DataLoader[Any]:
@@ -141,7 +141,7 @@ class EpochSampler(Sampler[list[tuple[int, int]]]):
         frames: number of frames.
         batch_size: frames per batch and rank.
         seed: of the order.
-        step: tells the optimizer steps done so far; None walks once through all frames in order (validation).
+        step: returns the optimizer steps so far; None: all frames once, in order (validation).
     """
 
     def __init__(

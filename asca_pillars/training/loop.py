@@ -1,4 +1,4 @@
-"""Training, on Lightning: what a run is stands here; launching, devices and the loop itself are Lightning's."""
+"""Training on Lightning, which does launching, devices and the loop itself."""
 
 import logging
 import warnings
@@ -72,7 +72,7 @@ def train(
         num_nodes: machines that train together, each started with the same command (torchrun, SLURM).
         init: checkpoint that a new run starts from, see `initial_weights`; a run that goes on must have started from
             them.
-        bar: shows or tells the progress; None: on the terminal.
+        bar: displays or reports the progress; None: on the terminal.
         remark: called with what is odd about the run; None: it is printed.
 
     Returns:
@@ -106,7 +106,7 @@ def _train(
     if isinstance(config.model, RefineModel):
         config = replace(config, model=with_first_stage(config.model))
     checkpoints = out / "checkpoints"
-    # What the run records of itself must hold for its checkpoint: without a camera it has seen whole scans.
+    # The recorded configuration must hold for the checkpoint: without a camera, training uses whole scans.
     view = config.data.camera_view and open_split(data_root).has_camera
     config = replace(config, data=replace(config.data, camera_view=view))
     recover(checkpoints)
@@ -114,7 +114,7 @@ def _train(
     goes_on = resumed is not None
     config = replace(config, train=_with_settled_precision(config.train, out, resumes=goes_on))
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
-    # What may be mistyped is looked at before minutes of work, and before the folder is that of this run.
+    # Arguments are checked before minutes of work, and before the folder is claimed for this run.
     weights = None if goes_on and init is None else initial_weights(config, init)
     files = AtomicCheckpointIO(keep_last=damage is None)
     last = LastCheckpoint(checkpoints, config.train.checkpoint_steps)
@@ -140,11 +140,11 @@ def _train(
     if weights and not goes_on:
         module.detector.load_state_dict(module.detector.state_dict() | weights)
     with warnings.catch_warnings(), interrupt.listening():
-        # Of torch and Lightning about each other.
+        # Warnings of torch and Lightning about each other.
         warnings.filterwarnings("ignore", message=".*LeafSpec")
         # EpochSampler starts at the step where the checkpoint stopped, which Lightning cannot know.
         warnings.filterwarnings("ignore", message="You're resuming from a checkpoint that ended before the epoch")
-        # Of a gradient of 1x1 convolutions, whose two layouts in memory are the same.
+        # Warning on the gradient of 1x1 convolutions, whose two memory layouts are the same.
         warnings.filterwarnings("ignore", message="Grad strides do not match bucket view strides")
         warnings.filterwarnings("ignore", message="Checkpoint directory .* exists and is not empty")
         # Advice on workers and logging that does not fit two cores and small data.
@@ -162,7 +162,7 @@ def _print(text: str) -> None:
 
 
 def syncs_statistics(model: ModelConfig) -> bool:
-    """Whether BatchNorm takes its statistics from all devices; on CPUs torch has no such thing.
+    """Return whether BatchNorm takes its statistics from all devices; torch does not support that on CPUs.
 
     In a step of two stages a device may have too few keypoints or proposals to take part, and the others would wait
     for its statistics forever. Each has thousands of rows, which are enough for statistics of its own.
@@ -171,7 +171,7 @@ def syncs_statistics(model: ModelConfig) -> bool:
 
 
 def _with_settled_precision(recipe: TrainConfig, out: Path, *, resumes: bool) -> TrainConfig:
-    """`auto` becomes what the run in `out` computes in, so that it goes on exactly, or what suits the device."""
+    """Resolve `auto` to the precision of the run in `out`, so that it resumes exactly, or to what suits the device."""
     auto = recipe.precision == "auto"
     precision = recorded_precision(out) if auto and resumes else recipe.precision
     return replace(recipe, precision=settled(precision))

@@ -1,4 +1,4 @@
-"""What one step of training and of validation does, whatever the family of detectors."""
+"""Steps of training and of validation, for every family of detectors."""
 
 import functools
 import math
@@ -38,13 +38,13 @@ class DetectionModule(L.LightningModule):
         self.recall = RecallTally(config.model.spec.class_names)
 
     def training_step(self, batch: Batch | AscaError, _: int) -> Tensor:
-        """The loss of one batch, a scalar.
+        """Return the loss of one batch, a scalar.
 
         Raises:
             AscaError: a frame of the batch could not be read, or a term of its loss is not finite.
         """
         batch = _read(batch)
-        # What a network drops at random belongs to the step, so that a resumed run drops what an unbroken one would.
+        # Dropout depends on the step, so that a resumed run drops the same as an uninterrupted one.
         draws = np.random.SeedSequence((self.config.train.seed, self.global_step, self.global_rank))
         torch.manual_seed(int(draws.generate_state(1, np.uint64)[0]))
         terms = self.detector.loss(self.detector.predict(batch.inputs), batch.inputs)
@@ -55,7 +55,7 @@ class DetectionModule(L.LightningModule):
         return total
 
     def validation_step(self, batch: Batch | AscaError, _: int) -> None:
-        """Loss, recall and false detections of one batch."""
+        """Log loss, recall and false detections of one batch."""
         batch = _read(batch)
         outputs = self.detector.predict(batch.inputs)
         terms = self.detector.loss(outputs, batch.inputs)
@@ -65,7 +65,7 @@ class DetectionModule(L.LightningModule):
             self.recall.add(detections, boxes, labels)
 
     def on_validation_epoch_end(self) -> None:
-        """Recall over the frames of all ranks: counts are summed, because a mean of shares is not the share."""
+        """Log recall over the frames of all ranks: counts are summed, because a mean of shares is not the share."""
         counts = self.trainer.strategy.reduce(torch.from_numpy(self.recall.counts).to(self.device), reduce_op="sum")
         self.recall = RecallTally(self.config.model.spec.class_names, counts.cpu().numpy())
         rows = self.recall.rows()
@@ -78,7 +78,7 @@ class DetectionModule(L.LightningModule):
         self.recall = RecallTally(self.config.model.spec.class_names)
 
     def configure_optimizers(self) -> Any:
-        """Adam, and the schedule of the configuration; both count optimizer steps."""
+        """Return Adam, and the schedule of the configuration; both count optimizer steps."""
         recipe = self.config.train
         optimizer = torch.optim.Adam(
             self.parameters(),
@@ -90,7 +90,7 @@ class DetectionModule(L.LightningModule):
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 
     def steps_per_epoch(self) -> int:
-        """Optimizer steps of one epoch.
+        """Return the optimizer steps of one epoch.
 
         Not Lightning's `estimated_stepping_batches`: that opens the loader before a checkpoint has told the step at
         which the sampler is to go on.
@@ -123,7 +123,7 @@ def _named(terms: Mapping[str, Tensor], stage: str) -> dict[str, Tensor]:
 
 
 def make_schedule(optimizer: Optimizer, recipe: TrainConfig, epoch_steps: int) -> Any:
-    """The schedule that `recipe` names, stepped once for each optimizer step, of which an epoch has `epoch_steps`."""
+    """Return the schedule that `recipe` names, stepped once per optimizer step; an epoch has `epoch_steps`."""
     if recipe.schedule == "step":
         # Counted in steps, so that a checkpoint taken just before the end of an epoch holds all of its state.
         return StepLR(optimizer, recipe.decay_epochs * epoch_steps, recipe.decay)
@@ -134,13 +134,13 @@ def make_schedule(optimizer: Optimizer, recipe: TrainConfig, epoch_steps: int) -
         optimizer,
         max_lr=recipe.learning_rate,
         total_steps=total_steps,
-        pct_start=0.3,  # of fast.ai's one cycle, torch's default, stated because it is the recipe
+        pct_start=0.3,  # fast.ai's one-cycle value and torch's default, stated because it is part of the recipe
         div_factor=10,  # as OpenPCDet starts it
     )
 
 
 def warmup_stable_decay(recipe: TrainConfig, total_steps: int, step: int) -> float:
-    """Factor of the learning rate at `step` of `total_steps`: a linear rise, then 1, then a linear fall.
+    """Return the factor of the learning rate at `step` of `total_steps`: a linear rise, then 1, then a linear fall.
 
     It is more than 0 at every step from 0 to `total_steps` - 1 (Hu et al., MiniCPM, arXiv 2404.06395).
     """
@@ -150,19 +150,19 @@ def warmup_stable_decay(recipe: TrainConfig, total_steps: int, step: int) -> flo
 
 
 def cooldown_start(recipe: TrainConfig, total_steps: int) -> int:
-    """First step of `warmup_stable_decay` whose rate depends on how long the run is."""
+    """Return the first step of `warmup_stable_decay` whose rate depends on the length of the run."""
     return math.ceil((1 - recipe.cooldown) * total_steps)
 
 
 def steps_per_epoch(recipe: TrainConfig, frames: int, processes: int) -> int:
-    """Optimizer steps of one epoch: whole batches of every process."""
+    """Return the optimizer steps of one epoch: whole batches of every process."""
     return frames // (recipe.batch_size * processes)
 
 
 def has_bfloat16(device: str | None = None) -> bool:
     """Return whether a device multiplies in bfloat16 itself. None is Lightning's choice: a GPU if there is one.
 
-    One that does not still computes it, number by number: twenty times slower than float32 on a CPU with AVX2 alone.
+    Others emulate it: twenty times slower than float32 on a CPU with AVX2 alone.
     """
     if device != "cpu" and torch.cuda.is_available():
         return torch.cuda.is_bf16_supported(including_emulation=False)
@@ -170,7 +170,7 @@ def has_bfloat16(device: str | None = None) -> bool:
 
 
 def settled(precision: Precision, device: str | None = None) -> Precision:
-    """`auto` as what suits a device, others as they are, see `has_bfloat16`."""
+    """Resolve `auto` to what suits a device; other values stay, see `has_bfloat16`."""
     if precision != "auto":
         return precision
     return "bf16" if has_bfloat16(device) else "fp32"

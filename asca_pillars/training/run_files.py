@@ -1,4 +1,4 @@
-"""The files in the folder of a run, and whether those that are there are of a run."""
+"""Files in the folder of a run, and the recognition of earlier ones."""
 
 from pathlib import Path
 
@@ -62,7 +62,7 @@ def is_own_expected_input(path: Path) -> bool:
 
 
 def _is_older(path: Path, keys: tuple[str, ...]) -> bool:
-    """Return whether it was written before files said by whom: in the folder of a run, plain, and with every key."""
+    """Return whether it is a file of an older version without its origin: in a run's folder, plain, with every key."""
     environment = path.with_name(ENVIRONMENT_FILE)
     if not environment.is_file() or not _IS_ENVIRONMENT(environment):
         return False

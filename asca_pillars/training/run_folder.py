@@ -1,4 +1,4 @@
-"""The folder of a run: what it is, so that only the same run goes on in it."""
+"""Identity of the run in a folder, so that only the same run resumes there."""
 
 import hashlib
 from collections.abc import Mapping
@@ -40,23 +40,23 @@ NOT_OF_THE_RUN = ("data.workers", "data.prepared", "train.checkpoint_steps")
 
 
 class Seen(NamedTuple):
-    """What follows from neither the configuration nor the seed: frames, processes and the weights at the start."""
+    """Inputs of a run besides configuration and seed: frames, processes and initial weights."""
 
     frames: int
     frames_sha256: str
-    """Of their ids and of how large their scans are: two datasets number their frames alike."""
+    """SHA-256 of the frames' ids and of the sizes of their scans, as two datasets may number frames alike."""
     processes: int
     initial_sha256: str | None = None
-    """Of the weights that the run started from; empty of random ones, None where that is not known."""
+    """SHA-256 of the initial weights; empty for random ones, None where it is not known."""
 
     @classmethod
     def of(cls, split: LabeledSplit, processes: int, initial: Mapping[str, Tensor] | None = None) -> "Seen":
-        """Of training on these frames.
+        """Return the inputs of a run on these frames.
 
         Args:
             split: the frames.
             processes: how many.
-            initial: weights, empty where all are random; None where a run goes on whose start is not stated again.
+            initial: weights, empty where all are random; None where a resumed run's start is not given again.
 
         Raises:
             OSError: a scan is not there.
@@ -70,8 +70,7 @@ def claim(out: Path, config: Config, seen: Seen, steps: int = 0) -> None:
     """Write what this run is into `out`, or make sure that the run found there is the same one.
 
     A run may be made longer where its steps so far are those of the longer run: always with the `step` schedule, and
-    with `warmup_stable_decay` until its rate falls. One without any checkpoint has learnt nothing, so that another
-    takes its place.
+    with `warmup_stable_decay` until its rate falls. A run without any checkpoint may be replaced.
 
     Args:
         out: folder of the run.
@@ -100,13 +99,13 @@ def claim(out: Path, config: Config, seen: Seen, steps: int = 0) -> None:
 
 
 def recorded_precision(out: Path) -> Precision:
-    """Which `train.precision` the run in `out` was started with; `auto` where that is not written down."""
+    """Return the `train.precision` that the run in `out` was started with; `auto` where it is not recorded."""
     path = out / CONFIG_FILE
     return load_config(path).train.precision if path.exists() else "auto"
 
 
 def measure_input(out: Path, frames: TrainingFrames, *, keep: bool, bar: bool = True) -> ExpectedInput:
-    """What up to EXPECTED_INPUT_FRAMES evenly spaced training scans look like; with `keep` as `out` has it already.
+    """Measure up to EXPECTED_INPUT_FRAMES evenly spaced training scans; with `keep`, a measurement in `out` is read.
 
     `bar` shows a progress bar on the terminal.
 
@@ -133,10 +132,10 @@ def measure_input(out: Path, frames: TrainingFrames, *, keep: bool, bar: bool = 
 
 
 def _why_another(path: Path, config: Config, seen: Seen, steps: int) -> str | None:
-    """In what words `config` is another run than the one that `path` is of; None if it is the same, or longer."""
+    """Return in words how `config` differs from the run that `path` is of; None if it is the same run, or longer."""
     found_config = load_config(path)  # a run of an older version lacks keys that are younger, not their values
     found = to_dict(found_config)
-    if found_config.train.precision == "auto":  # of an older version, which did not write down what it became
+    if found_config.train.precision == "auto":  # an older version, which did not record the resolved value
         found["train"]["precision"] = config.train.precision
     longer = config.train.epochs > found_config.train.epochs
     recipe = found_config.train
@@ -163,7 +162,7 @@ def _why_another(path: Path, config: Config, seen: Seen, steps: int) -> str | No
 
 
 def _why_other_frames(path: Path, found: Seen, seen: Seen) -> str | None:
-    """In what words `seen` is not what was found in `path` of the run there; None if it is."""
+    """Return in words how `seen` differs from that of the run in `path`; None if it does not."""
     if found.processes != seen.processes:
         return (
             f"{path}: the run there was started with {found.processes} process(es), now {seen.processes}: its steps "

@@ -71,7 +71,7 @@ class SharedInputs:
 
 
 def _opened(placed: Any, memory: Any, size: int) -> Any:
-    """The inputs of a `SharedInputs`, tensors on the same memory."""
+    """Return the inputs of a `SharedInputs`, tensors on the same memory."""
     descriptor = memory.detach()
     try:
         content = mmap.mmap(descriptor, size) if size else b""
@@ -89,7 +89,7 @@ def _opened(placed: Any, memory: Any, size: int) -> Any:
 
 @dataclass(frozen=True)
 class ShareCollated:
-    """A collate function of loader processes: as `collate`, and the tensors of its batches in anonymous memory.
+    """Collate function of loader processes, with the tensors of its batches in anonymous memory.
 
     A batch that cannot be stored becomes the error that the training ends with.
     """
@@ -97,7 +97,7 @@ class ShareCollated:
     collate: Callable[[Sequence[Sample | AscaError]], Batch | AscaError]
 
     def __call__(self, samples: Sequence[Sample | AscaError]) -> Batch | AscaError:
-        """Make a batch, or give the first error."""
+        """Make a batch, or return the first error."""
         try:
             batch = self.collate(samples)
             if isinstance(batch, Batch) and hasattr(os, "memfd_create"):
@@ -111,7 +111,7 @@ class ShareCollated:
 
 
 def loader_context() -> ForkServerContext:
-    """How `DataLoader` starts its processes.
+    """Return the multiprocessing context in which `DataLoader` starts its processes.
 
     Each process would import torch for itself otherwise: seconds of start, and hundreds of MiB that are shared now.
     """
@@ -121,14 +121,14 @@ def loader_context() -> ForkServerContext:
 
 
 def start_loader_process(_: int) -> None:
-    """What a process does before its first batch."""
+    """Set up a loader process before its first batch."""
     leave_interrupts_to_the_loop()
     # Else the batch would be lost, and the loop would wait for it forever: it notices a process that has ended.
     Queue._on_queue_feeder_error = staticmethod(_end)  # type: ignore[attr-defined]
 
 
 def leave_interrupts_to_the_loop() -> None:
-    """Ctrl-C reaches every process of the terminal, SIGTERM of a batch system every one of the job.
+    """Ignore Ctrl-C and the first SIGTERM, which reach every process, in favor of the training loop.
 
     A step that is under way still needs its batch. A second SIGTERM ends the process: it is the loader's own.
     """

@@ -1,4 +1,4 @@
-"""A configuration and a dataset become a checkpoint; PyTorch is imported when it begins."""
+"""Training as a Python function; PyTorch is imported when it begins."""
 
 from collections.abc import Sequence
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""The detector on the vehicle: ONNX Runtime and NumPy, never PyTorch."""
+"""Runtime of the detector: ONNX Runtime and NumPy, without PyTorch."""
 
 from asca_deploy.bundle import Bundle
 from asca_deploy.detector import Detector

@@ -1,15 +1,15 @@
-"""Every direction with a bundle that looks ahead: in one pass where its weights know every direction, else in several.
+"""Detection in every direction with a model that looks ahead: one pass with wider ranges, or several turned ones.
 
-A sparse neck's graphs hold no ranges, so that a bundle trained on whole revolutions looks around with wider ones
+A sparse neck's graphs hold no ranges, so that a bundle trained on whole revolutions is run with wider ones
 (`widened`). With others the scan is turned before each pass, and the boxes are turned back:
 
     pass 0: ahead     pass 1: left     pass 2: behind     pass 3: right
 
-The scan turns about the normal of its ground. A sensor that is pitched by half a degree sees the road ahead rise, as
-the model did in its training; turned about the sensor's own axis, the road behind would sink, and less would be found.
+The scan turns about the normal of its ground. With a sensor pitched by half a degree the road ahead rises, as in the
+training data; turned about the sensor's axis, the road behind would sink, and fewer objects would be found.
 
-Neighbouring passes both see what stands between them. Of boxes of a class that overlap, the one stays that its pass
-sees nearest to straight ahead, where the model has seen the most in training.
+Objects between two sectors are found by both passes. Of overlapping boxes of a class, that one is kept which is nearest
+to straight ahead in its pass, where the model had the most training data.
 """
 
 import math
@@ -29,20 +29,20 @@ from asca_pillars.ops.pillar.grid import NECK_STRIDE
 from asca_pillars.scans.ground_height import fit_ground_plane
 
 CAMERA_FIELD_RAD = math.pi / 4
-"""To each side of a camera's view: KITTI's sees 41 degrees to each side, and a car there is often cut."""
+"""Half the assumed field of view of a camera: KITTI's sees 41 degrees to each side, and a car there is often cut."""
 SEAM_MARGIN_RAD = math.radians(10)
-"""How far beyond its own sector a pass still reports, for the neighbour may place the center on the other side."""
+"""Margin beside a pass's sector in which it still reports boxes: the next pass may place the center differently."""
 GROUND_POINTS = 10_000
-"""Of a scan that its ground is looked for in: the normal is then that of all points to some hundredths of a degree."""
+"""Points of a scan that its ground is fitted to: the normal then differs by some hundredths of a degree."""
 _HALF_TURN_RAD = math.pi
 _STEP_RAD = math.radians(1)
 
 
 def widened(bundle: Bundle) -> Bundle:
-    """The bundle with ranges that reach in every direction as far as its own do in one, where its graphs allow it.
+    """Return the bundle with ranges widened in every direction to its farthest reach, where its graphs allow it.
 
-    They do with a sparse neck, which reads rulebooks instead of a map, on even pillars, if the weights were trained on
-    whole revolutions. Other bundles are returned as they are. `max_pillars` grows with the area.
+    That requires a sparse neck, which reads rulebooks instead of a map, pillars of one size, and weights trained on
+    whole revolutions. Other bundles are returned unchanged. `max_pillars` grows with the area.
     """
     if not isinstance(bundle, PillarBundle) or bundle.pillar.neck == "dense" or bundle.expected_input.camera_view:
         return bundle
@@ -58,17 +58,17 @@ def widened(bundle: Bundle) -> Bundle:
 
 
 def _fitting_range(reach_m: float, pillar_m: float) -> float:
-    """The shortest range from `reach_m` on that pillars of this size fill as the network's strides need it."""
+    """Return the shortest range from `reach_m` on that holds whole pillars and fits the network's strides."""
     step_m = NECK_STRIDE * pillar_m
     return round(math.ceil(reach_m / step_m - 1e-6) * step_m, 6)
 
 
 def turns_around(ranges: Ranges, *, camera_view: bool) -> tuple[FrameChange, ...]:
-    """What each pass turns the scan by; the first one by nothing.
+    """Return the turn of the scan for each pass; the first one is the identity.
 
-    As few passes as show every direction, and the margin beside each sector, as far as the model sees ahead or to its
-    nearer side, whichever is less, and, for a model trained on a camera's view, within that view. A model that looks
-    all around takes one.
+    There are as few passes as cover every direction, and the margin beside each sector, as far as the model sees
+    ahead or to its nearer side, whichever is less, and, for a model trained on a camera's view, within that view. A
+    model that looks all around takes one.
 
     Args:
         ranges: of the model.
@@ -92,9 +92,9 @@ def turns_around(ranges: Ranges, *, camera_view: bool) -> tuple[FrameChange, ...
 
 
 def about_ground(turns: Sequence[FrameChange], points: NDArray[np.float32]) -> tuple[FrameChange, ...]:
-    """The turns about the normal of a scan's ground, through its origin; about z where no ground is sure.
+    """Return the turns about the normal of a scan's ground, through its origin; about z where no ground is found.
 
-    In all of them the ground then lies as it does before them. The first turn, which is none, stays as it is.
+    The ground keeps its pose in all of them. The first turn, the identity, is not changed.
 
     Args:
         turns: see `turns_around`.
@@ -111,7 +111,7 @@ def about_ground(turns: Sequence[FrameChange], points: NDArray[np.float32]) -> t
 
 
 def ranges_around(ranges: Ranges, passes: int) -> Ranges:
-    """Where the passes look together."""
+    """Return the ranges that the passes cover together."""
     if passes == 1:
         return ranges
     reach = max(abs(end) for end in (*ranges.x_m, *ranges.y_m))
@@ -119,12 +119,12 @@ def ranges_around(ranges: Ranges, passes: int) -> Ranges:
 
 
 def merge(passes: Sequence[Detections], turns: Sequence[FrameChange], nms_iou: float) -> Detections:
-    """The boxes of all passes in the frame before the turns, each object once, best first.
+    """Return the boxes of all passes in the frame before the turns, each object once, best first.
 
     Args:
         passes: of each turn, in its turned frame; two or more.
         turns: see `turns_around`.
-        nms_iou: boxes of a class that overlap more, seen from above, are one object.
+        nms_iou: BEV IoU of two boxes of a class above which they are one object.
     """
     half_sector = _HALF_TURN_RAD / len(passes)
     boxes, scores, labels, off_ahead = [], [], [], []
@@ -149,10 +149,10 @@ def merge(passes: Sequence[Detections], turns: Sequence[FrameChange], nms_iou: f
 
 
 def _sees(ranges: Ranges, half_sector_rad: float, distance_m: float) -> bool:
-    """Whether a model sees so far in every direction of the sector around straight ahead, and of its margins."""
+    """Return whether a model sees to `distance_m` in every direction of the sector ahead and of its margins."""
     angles = np.arange(0, min(half_sector_rad + SEAM_MARGIN_RAD, _HALF_TURN_RAD), _STEP_RAD)
     x, y = distance_m * np.cos(angles), distance_m * np.sin(angles)
     (x_min, x_max), (y_min, y_max) = ranges.x_m, ranges.y_m
-    # What is nearer than a range that begins ahead of the sensor, no pass sees.
+    # No pass covers the space nearer than a range that begins ahead of the sensor.
     inside = (x >= min(x_min, 0.0)) & (x <= x_max) & (y <= y_max) & (-y >= y_min)
     return bool(inside.all())

@@ -1,4 +1,4 @@
-"""`provider="auto"`: of what is installed the fastest that finds in a scan what the stock CPU finds in float32."""
+"""Choice of `provider="auto"`: the fastest installed provider whose boxes agree with the CPU's in float32."""
 
 import time
 from collections.abc import Callable, Iterable
@@ -36,12 +36,12 @@ Network = TypeVar("Network")
 
 @dataclass(frozen=True)
 class Candidate:
-    """How one provider did in one precision."""
+    """Result of one provider in one precision."""
 
     provider: Provider
     precision: Precision
     median_ms: float | None
-    """From the points to the boxes, warm; None if it was not timed."""
+    """Median time from the points to the boxes, warm; None if it was not timed."""
     outcome: str
     """AGREES, or why it could not be taken."""
     weights: str = "float32"
@@ -53,7 +53,7 @@ class Candidate:
 
 
 class Choice(NamedTuple, Generic[Network]):
-    """What was taken, and how all of them did."""
+    """The network that was chosen, and the results of all candidates."""
 
     network: Network
     provider: Provider
@@ -70,10 +70,10 @@ def choose(
     clock: Callable[[], float] = time.perf_counter,
     weights: str = "float32",
 ) -> Choice[Network]:
-    """Open, compare and time one after the other; the fastest that agrees, float32 where that is about as fast.
+    """Open, compare and time candidates in turn; return the fastest that agrees, float32 where it is about as fast.
 
     Args:
-        names: (provider, precision) of the candidates beside REFERENCE, in the order in which they are tried.
+        names: (provider, precision) of the candidates besides REFERENCE, in the order of trials.
         open_network: of a provider and a precision.
         detect: the sample scan's boxes by a network.
         spec: whose thresholds those boxes had to reach.
@@ -82,7 +82,7 @@ def choose(
         weights: the bundle's own precision, for the report.
 
     Raises:
-        ProviderError: nothing in the precision that was asked for can be taken; says why.
+        ProviderError: no candidate in the requested precision can be used; the message says why.
         BundleError: the reference cannot run the graph.
     """
     reference = open_network(*REFERENCE)
@@ -91,7 +91,7 @@ def choose(
     best: tuple[Candidate, Network] | None = (candidates[0], reference)
     if precision not in (None, REFERENCE[1]):
         best = None
-    del reference  # what cannot be taken must not stay in memory
+    del reference  # a rejected network must not stay in memory
     start = clock()  # where the CPU is slow, the others are what it is asked for
     for name in names:
         if name == REFERENCE or precision not in (None, name[1]):
@@ -111,15 +111,15 @@ def choose(
 
 
 def summary(runs_on: str, candidates: Iterable[Candidate]) -> str:
-    """One line that says what was taken (`Detector.runs_on`) and why."""
+    """Return one line on what was chosen (`Detector.runs_on`) and why."""
     return f"auto takes {runs_on}: {'; '.join(map(str, candidates))}"
 
 
 def disagreement(expected: Detections, found: Detections, spec: DetectorSpec) -> str | None:
-    """The first box of either side without a partner on the other; None if every box has one.
+    """Return the first box of either side without a partner on the other; None if every box has one.
 
     Partners have the same class and are as near as the limits above demand. A box whose score ties with its class's
-    threshold needs none. Where there is no box above that, nothing is proven and nothing agrees.
+    threshold needs none. Without any box above its threshold, nothing agrees.
     """
     if not (~_ties(expected, spec)).any():
         return "unproven, the sample scan shows no clear object with this model"
@@ -134,7 +134,7 @@ def disagreement(expected: Detections, found: Detections, spec: DetectorSpec) ->
 class _Trial(NamedTuple, Generic[Network]):
     candidate: Candidate
     network: Network | None
-    """None unless it can be taken."""
+    """None unless it agrees with the reference."""
 
 
 def _try(
@@ -150,7 +150,7 @@ def _try(
         if differs := disagreement(expected, detect(network), spec):
             return _Trial(Candidate(*name, None, differs), None)
         return _Trial(Candidate(*name, _median_ms(detect, network, clock), AGREES), network)
-    except Exception as error:  # of onnxruntime or OpenVINO, which share no base; it only says that this one is out
+    except Exception as error:  # onnxruntime's and OpenVINO's share no base class; the candidate is rejected
         return _Trial(Candidate(*name, None, f"does not run: {first_line(error)}"), None)
 
 

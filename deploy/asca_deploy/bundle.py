@@ -1,8 +1,8 @@
-"""A model bundle: the folder that `asca export` writes and the detector runs, and nothing else is needed.
+"""Model bundle: the folder that `asca export` writes and `Detector` runs.
 
     *.onnx          the family's graphs
-    bundle.json     everything that must agree with the graphs, and where they come from
-    weights.ckpt    if it was asked for: what they were exported from, for training to go on from; nothing runs it
+    bundle.json     settings that must agree with the graphs, and the origin of the weights
+    weights.ckpt    optional: the trained weights, to resume training from; not read at run time
 
 docs/BUNDLE.md describes the files for readers in other languages; `manifest` reads, verifies and writes bundle.json.
 """
@@ -71,14 +71,14 @@ class GraphFile(Strict):
 
 @dataclass(frozen=True)
 class CanvasFormat(Strict):
-    """What backbone.onnx takes for a pseudo-image, and encoder.onnx gives for a pillar.
+    """Format of the pseudo-image that backbone.onnx takes, and of the pillar features that encoder.onnx returns.
 
     Raises:
         ConfigError: a value that the type cannot hold.
     """
 
     type: Literal["float32", "uint8"] = "float32"
-    """Of one value; uint8 is in the steps of the quantized graph, which saves it the conversion."""
+    """Type of one value; uint8 values are in steps of the quantized graph, which saves it the conversion."""
     empty: tuple[int, ...] = ()
     """Value of each channel (C,) where there is no pillar; () stands for zeros. A quantized channel has a zero of its
     own, because attention makes features negative."""
@@ -90,21 +90,22 @@ class CanvasFormat(Strict):
 
 @dataclass(frozen=True)
 class PillarSection(Strict):
-    """What only bundles of kind pillar have.
+    """Section `pillar` of bundle.json: settings of the pillar encoder and of the neck.
 
     Raises:
         ConfigError: channels and canvas, or neck and active_cells, do not fit each other.
     """
 
     cpa: str
-    """Reading of the correlative point attention in the encoder; the runtime need not know, people do."""
+    """Variant of the correlative point attention in the encoder; informative, not read at run time."""
     channels: int
     """C, features of one pillar."""
     canvas: CanvasFormat
     neck: Literal["dense", "sparse"] = "dense"
-    """`sparse`: backbone.onnx takes rows and neighbor tables, and answers at active head cells alone."""
+    """`sparse`: backbone.onnx takes rows and rulebooks, and its outputs are rows of active head cells."""
     active_cells: MaskRule | None = None
-    """Which cells are active in a sparse neck, see `asca_pillars.ops.pillar.neck_rulebooks`; None of a dense one."""
+    """Rule for the active cells of a sparse neck, see `asca_pillars.ops.pillar.neck_rulebooks`; None with a dense
+    one."""
 
     def __post_init__(self) -> None:
         if not 1 <= self.channels <= _MOST_CHANNELS:
@@ -120,7 +121,7 @@ class PillarSection(Strict):
 
 @dataclass(frozen=True)
 class RefineSection(Strict):
-    """What bundles of kind pillar_refine have besides `pillar`, which is about their first stage.
+    """Section `refine` of bundle.json: settings of the second stage of a pillar_refine bundle.
 
     Raises:
         ConfigError: no such number of channels.
@@ -129,11 +130,11 @@ class RefineSection(Strict):
     bev_channels: int
     """C of the backbone's output `neck`."""
     seen: FirstStageSettings
-    """Proposals and keypoints."""
+    """Settings of proposals and keypoints."""
     neighbors: RefineSettings
-    """Balls and grids."""
+    """Settings of balls and grids."""
     scores: Scores
-    """Of refined boxes."""
+    """Source of a refined box's score."""
 
     def __post_init__(self) -> None:
         if not 1 <= self.bev_channels <= _MOST_CHANNELS:
@@ -142,16 +143,17 @@ class RefineSection(Strict):
 
 @dataclass(frozen=True)
 class Parity(Strict):
-    """How far the exported float graphs are from the trained model, largest over the compared scans."""
+    """Largest differences between the exported float graphs and the trained model over the compared scans."""
 
     head_maps_max_abs_error: float
-    """Of a `pillar_refine` bundle also of the neck's map and of the second stage's confidences and residuals; of a
-    `pv_rcnn` bundle of what every graph gives, relative to its largest value where that is above 1."""
+    """Largest absolute difference of the head maps. For `pillar_refine` it includes the neck's map and the second
+    stage's confidences and residuals; for `pv_rcnn` the outputs of every graph, relative to their largest value where
+    that is above 1."""
     box_max_error_m: float
     yaw_max_error_rad: float
     scans: int
     tolerance: float
-    """What `head_maps_max_abs_error` had to stay under."""
+    """Upper bound for `head_maps_max_abs_error`."""
 
 
 @dataclass(frozen=True)
@@ -159,34 +161,34 @@ class LayerQuantization(Strict):
     """One layer of the backbone in the sensitivity sweep."""
 
     layer: str
-    """Its name in the model, such as `neck.blocks.0.0`."""
+    """Name of the layer in the model, such as `neck.blocks.0.0`."""
     logit_rms_error: float
-    """Of the class logits of the best anchors, if this layer alone stays in floating point."""
+    """RMS error of the class logits of the best anchors if this layer alone stays in floating point."""
     kept_float: bool
 
 
 @dataclass(frozen=True)
 class Quantization(Strict):
-    """How the 8-bit backbone was made, and how far it is from the float one on scans it was not calibrated on."""
+    """Calibration of the 8-bit backbone, and its differences from the float one on scans not calibrated on."""
 
     calibration_scans: int
     dropped_scans: int | None
-    """Scans that were not calibrated on because they are among the compared ones; None of a bundle of schema 2."""
+    """Scans left out of the calibration because they are among the compared ones; None in bundles of schema 2."""
     compared_scans: int
     layers: tuple[LayerQuantization, ...]
     logit_rms_error: float
-    """Of the class logits of the best anchors, all 8-bit layers together."""
+    """RMS error of the class logits of the best anchors, all 8-bit layers together."""
     boxes: int
     """Boxes that the float bundle reports on the compared scans."""
     boxes_matched: int
-    """Those that the 8-bit bundle reports too: same class, BEV IoU of at least 0.5."""
+    """Boxes of the float bundle that the 8-bit bundle reports too: same class, BEV IoU of at least 0.5."""
     boxes_added: int
     """Boxes that the 8-bit bundle alone reports."""
 
 
 @dataclass(frozen=True)
 class Provenance(Strict):
-    """Where the weights come from, enough to make them again.
+    """Origin of the weights, with what is needed to train them again.
 
     Raises:
         ConfigError: the weights' hash is none.
@@ -206,12 +208,12 @@ class Provenance(Strict):
     """Python, torch, onnx and the like at export."""
     machine: str
     weights_sha256: str | None = None
-    """Of the trained arrays, the same for every export of a checkpoint, see `asca_pillars.models.checkpoint_file`; None
-    in bundles made before it was recorded."""
+    """SHA-256 of the trained arrays, the same for every export of a checkpoint, see
+    `asca_pillars.models.checkpoint_file`; None in bundles made before it was recorded."""
     weights_file: Literal["weights.ckpt"] | None = None
-    """Checkpoint beside the graphs that holds the trained arrays in 16 bits; None where it was not asked for."""
+    """Checkpoint beside the graphs that holds the trained arrays in 16 bits; None if it was not exported."""
     weights_file_sha256: str | None = None
-    """Of that file; None in bundles made before it was recorded."""
+    """SHA-256 of `weights_file`; None in bundles made before it was recorded."""
 
     def __post_init__(self) -> None:
         _require_sha256(self.weights_file_sha256, "weights_file")
@@ -220,20 +222,20 @@ class Provenance(Strict):
 
 @dataclass(frozen=True)
 class PvRcnnSection(Strict):
-    """What only bundles of kind pv_rcnn have.
+    """Section `pv_rcnn` of bundle.json: channels and settings of PV-RCNN.
 
     Raises:
         ConfigError: no such number of channels.
     """
 
     voxel_channels: tuple[int, int, int, int, int]
-    """Of conv1 to conv4 and of conv_out."""
+    """Channels of conv1 to conv4 and of conv_out."""
     keypoint_channels: int
-    """Of a keypoint's fused feature."""
+    """Channels of a keypoint's fused feature."""
     settings: VoxelSetSettings
-    """Keypoints, proposals and neighbors."""
+    """Settings of keypoints, proposals and neighbors."""
     scores: Scores
-    """Of refined boxes."""
+    """Source of a refined box's score."""
 
     def __post_init__(self) -> None:
         for channels in (*self.voxel_channels, self.keypoint_channels):
@@ -243,49 +245,49 @@ class PvRcnnSection(Strict):
 
 @dataclass(frozen=True, kw_only=True)
 class Bundle(Strict):
-    """What bundle.json holds of a detector of any kind."""
+    """The fields of bundle.json that all kinds share."""
 
     name: str
     kind: str
-    """The family of detectors; the section of that name holds what only this family has."""
+    """Family of the detector, see GRAPHS."""
     spec: DetectorSpec
     precision: Literal["float32", "int8"]
-    """What backbone.onnx computes in; of kind `pv_rcnn` voxels.onnx too."""
+    """Type of the arithmetic of backbone.onnx; for kind `pv_rcnn` of voxels.onnx too."""
     backbone_gmac: float
-    """Multiply-accumulates of backbone.onnx, 10^9; of a sparse neck in the mean over the scans of `parity`."""
+    """Multiply-accumulates of backbone.onnx, 10^9; with a sparse neck the mean over the scans of `parity`."""
     graphs: Mapping[str, GraphFile]
-    """By name, see GRAPHS."""
+    """Graphs by name, see GRAPHS."""
     parity: Parity | None
-    """None only while the export is still proving it; of a quantized bundle, the float graphs it was made from."""
+    """Parity of the float graphs; None only until the export has measured it."""
     quantization: Quantization | None
     """None in float32."""
     expected_input: ExpectedInput
     expected_input_from: Literal["training", "export"]
-    """The scans that `expected_input` was measured on: those trained on, or those given to the export."""
+    """Scans that `expected_input` was measured on: those of the training, or those given to the export."""
     provenance: Provenance
     license: str
     schema_version: int = SCHEMA_VERSION
 
     @property
     def graph_names(self) -> tuple[str, ...]:
-        """Which graphs a bundle of this kind has."""
+        """Names of the graphs of this kind."""
         return GRAPHS[self.kind]
 
 
 @dataclass(frozen=True, kw_only=True)
 class PillarBundle(Bundle):
-    """Of a pillar detector, with or without a second stage; but for `pillar.layout`, which follows from `spec`."""
+    """Bundle of a pillar detector, with or without a second stage. `pillar.layout` of the file follows from `spec`."""
 
     kind: Literal["pillar", "pillar_refine"]
     spec: PillarSpec
     pillar: PillarSection
     refine: RefineSection | None = None
-    """None of kind pillar, whose bundle.json does not have the key."""
+    """None for kind pillar, whose bundle.json lacks the key."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class PvRcnnBundle(Bundle):
-    """Of PV-RCNN."""
+    """Bundle of PV-RCNN."""
 
     kind: Literal["pv_rcnn"]
     spec: VoxelSpec
@@ -293,13 +295,13 @@ class PvRcnnBundle(Bundle):
 
     @property
     def graph_names(self) -> tuple[str, ...]:
-        """With DEFORM where keypoints are shifted."""
+        """Names of the graphs, with DEFORM where keypoints are shifted."""
         shifts = (DEFORM,) if self.pv_rcnn.settings.deformed else ()
         return (*GRAPHS[self.kind], *shifts)
 
 
 def weights_digest(bundle: Bundle) -> str:
-    """The SHA-256 of the trained arrays, the same in every export; of a bundle that lacks it, that of its graphs'."""
+    """Return the SHA-256 of the trained arrays, the same in every export; if not recorded, one over the graphs'."""
     graphs = "".join(bundle.graphs[name].sha256 for name in sorted(bundle.graphs))
     return bundle.provenance.weights_sha256 or hashlib.sha256(graphs.encode()).hexdigest()
 

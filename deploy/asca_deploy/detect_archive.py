@@ -1,4 +1,4 @@
-"""`asca detect --cluster`: very many scans on the workers of a cluster, one file of boxes in the end."""
+"""Detection in very many scans on the workers of a cluster, into one file: `asca detect --cluster`."""
 
 import hashlib
 import json
@@ -43,11 +43,11 @@ from asca_pillars.scans.scan_settings import ScanSettings
 
 SHARDS = "shards"
 _SHARD_SCANS = (16, 256)
-"""Fewest and most. A shard of the most takes some ten seconds, so that little is done twice; the fewest make the cost
-of a shard small beside that of its scans."""
+"""Smallest and largest shard. The largest takes some ten seconds, so that little is repeated; with the smallest, the
+cost of a shard is still small beside that of its scans."""
 _SHARDS_WANTED = 256
 READ_AGAIN_AFTER_S = (1.0, 5.0)
-"""Pauses before a scan that the system cannot read is tried again: network mounts have bad moments."""
+"""Pauses before a scan that the system cannot read is tried again, for network mounts that fail now and then."""
 _ERROR = '{"error": '
 
 
@@ -96,7 +96,7 @@ class DetectShard:
     bundle_sha256: str
 
     def __call__(self, shard: Shard) -> None:
-        """Items are (path, reflectance scale).
+        """Detect in items (path, reflectance scale).
 
         Raises:
             AscaError: the detector cannot be opened here, or a folder of scans not be seen.
@@ -134,7 +134,7 @@ class DetectShard:
 
 
 def error_line(path: str, reason: str) -> str:
-    """The line of a scan without results."""
+    """Return the line of a scan without results."""
     return json.dumps({"error": reason, "scan": path}) + "\n"
 
 
@@ -159,7 +159,7 @@ def detect_archive(
         options: which model runs, and how.
         reading: how the files are read and the sensor was mounted.
         score: report detections from this score on, or by class; None: the thresholds of the model.
-        around: look in every direction, by turned passes.
+        around: detect in every direction, see `asca_deploy.around`.
         progress: called while it is found out what an earlier run has done.
         remark: called with what was decided for a folder.
 
@@ -212,7 +212,7 @@ def merge(lines: Iterable[str], out: Path) -> Counts:
 
 
 def _work(job: DetectShard, folder: ShardFolder, todo: Sequence[Shard], done: int, address: str) -> int:
-    """Have the shards done; returns how often one was begun again."""
+    """Process the shards; return how often one was restarted."""
     if not todo:
         return 0
     whole = {shard.name for shard in todo}
@@ -280,7 +280,7 @@ def _job(
 
 
 def _results_depend_on(job: DetectShard, scans: Sequence[Path]) -> dict[str, object]:
-    """Plain values. Paths of scans, as they were given, and their reflectance scales are in the names of shards."""
+    """Return the settings that results depend on, as plain values."""
     relative = any(not path.is_absolute() for path in scans)
     return {
         "working_folder": str(job.start) if relative else None,
@@ -301,7 +301,7 @@ def _scores(job: DetectShard) -> ScoreThresholds | None:
 
 @lru_cache(maxsize=1)
 def _detector(job: DetectShard) -> Detector:
-    """Opened once in a worker's process."""
+    """Return the detector, opened once per worker process."""
     logging.getLogger("asca_pillars").setLevel(logging.ERROR)  # warnings are in the lines
     detector = open_detector(job.options, _scores(job), job.mounting, around=job.around)
     if bundle_digest(detector.folder) != job.bundle_sha256:
@@ -310,5 +310,5 @@ def _detector(job: DetectShard) -> Detector:
 
 
 def bundle_digest(bundle: Path) -> str:
-    """SHA-256 of the manifest, which holds those of the graphs."""
+    """Return the SHA-256 of the manifest, which holds those of the graphs."""
     return hashlib.sha256((bundle / MANIFEST).read_bytes()).hexdigest()

@@ -1,4 +1,4 @@
-"""Scan files one after the other: boxes in memory and, if wanted, as files."""
+"""Detection in scan files: boxes in memory and, if wanted, as files."""
 
 import errno
 import re
@@ -34,7 +34,7 @@ from asca_pillars.scans.scan_times import require_one_folder, scan_times_ns
 
 _NUMBER = re.compile(r"\d[\d.,]*")
 FRAME_ID = "lidar"
-"""The frame of scan files, which name none, for viewers."""
+"""Frame of scan files, which name none, for viewers."""
 _PLAIN = RuntimeOptions()
 _AS_TRAINED = ScanSettings()
 
@@ -43,7 +43,7 @@ _AS_TRAINED = ScanSettings()
 class DetectedScan:
     """One scan: its file, what was repaired while reading it, and its boxes with their report.
 
-    `tracks` are the same boxes with identities and velocities, if they were asked for.
+    `tracks` are the same boxes with identities and velocities, with tracking.
     """
 
     path: Path
@@ -109,7 +109,7 @@ def detect_scans(
         options: which model runs, and how.
         reading: how the files are read and the sensor was mounted.
         score: report detections from this score on, or by class; None: the thresholds of the model.
-        around: look in every direction, by turned passes.
+        around: detect in every direction, see `asca_deploy.around`.
         pictures: whether pictures are drawn into `out`.
         track: give boxes identities and velocities over time; the scans then lie in one folder, in order.
         rate_hz: scans per second of that folder; None: 10.
@@ -185,12 +185,12 @@ def detect_scans(
 
 
 def repairs(results: Iterable[DetectedScan]) -> Iterator[str]:
-    """Yield what was repaired, dropped or odd, each kind once, with the first scan that it concerns and a count."""
+    """Return what was repaired, dropped or odd, each kind once, with the first such scan and a count."""
     return repairs_of((result.path.name, result.notes, result.detections.report.warnings) for result in results)
 
 
 def repairs_of(scans: Iterable[tuple[str, ScanNotes, Sequence[str]]]) -> Iterator[str]:
-    """As `repairs`, of the name of each scan, what was done when it was read, and warnings of it."""
+    """Yield `repairs` from the name of each scan, the notes of its reading, and its warnings."""
     names: dict[str, list[str]] = defaultdict(list)
     for name, notes, warnings in scans:
         texts = [*notes.remarks, *warnings]
@@ -202,6 +202,6 @@ def repairs_of(scans: Iterable[tuple[str, ScanNotes, Sequence[str]]]) -> Iterato
                 "to the nearer end; if they are stored on another scale, state it (--reflectance-scale)"
             )
         for text in texts:
-            names[_NUMBER.sub("#", text)].append(f"{name}: {text}")  # of one kind: alike but for numbers
+            names[_NUMBER.sub("#", text)].append(f"{name}: {text}")  # one kind: equal but for numbers
     for lines in names.values():
         yield lines[0] + (f" (and {len(lines) - 1} more scans alike)" if lines[1:] else "")

@@ -1,4 +1,4 @@
-"""From a scan to boxes without PyTorch: what every family of detectors shares around its pipeline."""
+"""Detector without PyTorch, with the steps around the pipeline that all detector families share."""
 
 import logging
 import weakref
@@ -34,12 +34,12 @@ _log = logging.getLogger("asca_pillars")
 
 
 View: TypeAlias = Literal["ahead", "around"]
-_WAITING = "waiting"  # beside the names of stages
+_WAITING = "waiting"  # in addition to the names of stages
 _GIVE = "give (N, 4) real numbers: x, y, z, reflectance"
 
 
 class UsablePoints(NamedTuple):
-    """The points that a pipeline takes, and what was done to get them."""
+    """Points for a pipeline, and how many were dropped or clipped."""
 
     points: NDArray[np.float32]
     """(N, 4), finite, reflectance within 0..1."""
@@ -50,44 +50,44 @@ class UsablePoints(NamedTuple):
 
 
 class _Frame(NamedTuple):
-    """A scan between its points and its boxes."""
+    """State of a scan between its points and its boxes."""
 
     start: float
     laps: Laps
     usable: UsablePoints
-    """In the model's frame."""
+    """Points in the model's frame."""
     turns: tuple[FrameChange, ...]
-    """Of the passes."""
+    """Turn of each pass."""
     counts: list[ScanCounts]
-    """Of each pass so far."""
+    """Counts of each pass prepared so far."""
     warnings: list[InputWarning]
     source: Any
-    """What the caller gave."""
+    """The points as the caller gave them."""
 
 
 class Detector:
     """A detector of any kind that ships or was exported, without PyTorch.
 
-    One object may be called from several threads at once and gives each the boxes that it would get alone: nothing
-    of a scan is kept in it. That costs a pseudo-image per thread (`PillarPipeline`) and no lock; the calls share the
-    network's threads, so several callers get more scans per second only where one leaves cores idle.
+    A detector is thread-safe: it keeps no state of a scan, and each call returns the same boxes as alone. Each calling
+    thread needs a pseudo-image of its own (`PillarPipeline`) and no lock; calls share the network's threads, so several
+    callers get more scans per second only where one leaves cores idle.
 
     Args:
         bundle: folder written by `asca export`, or name of one that ships (`shipped_bundles`); None for the
             default, see `default_bundle_path`.
         provider: of the slowest network: "cpu", "cuda", "tensorrt", "openvino", or "auto" for the fastest one available
-            that finds in the sample scan what "cpu" finds. `self.provider` and `self.precision` say what was taken,
-            `self.candidates` how each one did. The other graphs always run on onnxruntime's CPU provider.
+            whose boxes in the sample scan agree with those of "cpu". `self.provider` and `self.precision` are the
+            choice, `self.candidates` the results. The other graphs always run on onnxruntime's CPU provider.
         precision: "float32", in which the bundle was proven, or "reduced" where the provider has something faster
             (`asca_deploy.providers`); None for float32, with "auto" for either.
         threads: of the CPU; None for the physical cores granted to the process.
         score_threshold: overrides that of every class, or of the classes named, such as {"Car": 0.4}; None keeps the
             bundle's.
-        mounting: how the scans' frame lies to the model's. Points come and boxes go in the scans' own frame. None: the
-            scans are as those of the training.
+        mounting: pose of the scans' frame relative to the model's. Points and boxes are in the scans' frame. None: the
+            scans are like those of the training.
         view: "ahead", or "around" for every direction: one pass with wider ranges where the model was trained on whole
             revolutions (`asca_deploy.around`), else as many turned passes as its field of view needs, merged.
-            `self.passes` says how many; each turned one costs what a scan ahead costs.
+            `self.passes` is their number; each turned one costs as much as a scan ahead.
 
     Raises:
         BundleError: the bundle is missing, damaged or made for another version.
@@ -107,7 +107,7 @@ class Detector:
         view: View = "ahead",
     ) -> None:
         start = perf_counter()
-        load_kernels(decode.KERNELS)  # here rather than in the first scan
+        load_kernels(decode.KERNELS)  # not during the first scan
         self.folder = find_bundle(bundle)
         self.threads = check_threads(threads)
         check_onnxruntime()
@@ -152,8 +152,8 @@ class Detector:
     def warm_up(self, points: int = 100_000, scans: int = 2) -> float:
         """Detect in made-up scans, so that the first real one takes no longer than the others.
 
-        Compiles what is not compiled yet, and lets the runtime allocate for scans of this size. Nothing of it is
-        logged or warned of.
+        Compiles kernels that are not compiled yet, and lets the runtime allocate memory for scans of this size. Logs
+        and warns of nothing.
 
         Args:
             points: of each scan.
@@ -176,7 +176,7 @@ class Detector:
 
     @property
     def passes(self) -> int:
-        """How often the network runs for a scan: once, or in every direction with `view="around"`."""
+        """Number of passes of the network per scan: 1, or as many as `view="around"` needs."""
         return len(self._turns)
 
     def __call__(self, points: NDArray[Any]) -> ScanDetections:
@@ -201,13 +201,13 @@ class Detector:
         return self._finish(frame, raw)
 
     def stream(self, scans: Iterable[NDArray[Any]]) -> Generator[ScanDetections, None, None]:
-        """Detections of scan after scan, in order, the same as one by one and more of them per second.
+        """Yield the detections of scan after scan, in order: those of single calls, at a higher rate.
 
         While the network works on one scan, the next is read and prepared and the one before is decoded, in threads
         that live as long as the iterator; see `asca_deploy.stream`.
 
         Args:
-            scans: (N, 4) each, as for a call; read in another thread, at most one ahead of the one asked for.
+            scans: (N, 4) each, as for a call; read in another thread, at most one ahead of the one requested.
 
         Raises:
             ScanError: a scan cannot be used; the scans before it have been yielded. Errors of `scans` itself come in
@@ -231,7 +231,7 @@ class Detector:
         return overlapped(scans, prepare, infer, finish)
 
     def _open(self, points: NDArray[Any]) -> _Frame:
-        """The usable points in the model's frame."""
+        """Return the usable points in the model's frame."""
         start = perf_counter()
         usable = usable_points(points, self._to_model)
         warnings = []
@@ -242,7 +242,7 @@ class Detector:
         return _Frame(start, [("input", perf_counter())], usable, turns, [], warnings, points)
 
     def _prepare(self, frame: _Frame, turn: FrameChange) -> Any:
-        """All of one pass before the slowest network; the first one compares the scan with those of the training."""
+        """Prepare one pass for the slowest network; in the first pass, check the scan against the expected input."""
         points = frame.usable.points if turn.is_identity else turn.points(frame.usable.points)
         frame.laps.append(("input", perf_counter()))
         prepared = self.pipeline.prepare(points, frame.laps)
@@ -300,7 +300,7 @@ class Detector:
 
 
 def usable_points(points: NDArray[Any], to_model: FrameChange | None = None) -> UsablePoints:
-    """The points of (N, 4) that are finite in the model's frame as contiguous float32, reflectance within 0..1.
+    """Return the points of (N, 4) that are finite in the model's frame as contiguous float32, reflectance within 0..1.
 
     Args:
         points: (N, 4) x, y, z in metres and reflectance, of any real type.
@@ -319,7 +319,7 @@ def usable_points(points: NDArray[Any], to_model: FrameChange | None = None) -> 
         raise ScanError(f"the points are not an array of numbers; {_GIVE}") from None
     if array.dtype.kind not in "iuf":
         raise ScanError(f"the points are not an array of numbers, but of type {str(array.dtype)[:40]}; {_GIVE}")
-    with np.errstate(over="ignore"):  # what float32 cannot hold becomes infinite and is counted
+    with np.errstate(over="ignore"):  # values beyond float32 become infinite and are counted
         scan = np.ascontiguousarray(array, np.float32)
     if scan.ndim != 2 or scan.shape[1] != 4:
         columns = scan.shape[1] if scan.ndim == 2 else 0

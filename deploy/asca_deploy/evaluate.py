@@ -1,4 +1,4 @@
-"""A model, or finished predictions, against labels."""
+"""Evaluation of a model, or of finished predictions, against labels."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -50,9 +50,9 @@ def evaluate(
         labels: folder of KITTI labels, with `predictions`; None: those of `data`.
         score: score from which on detections count for recall, precision and gallery; None: the model's.
         min_score: lowest score that the model is run with.
-        around: look in every direction, by turned passes.
+        around: detect in every direction, see `asca_deploy.around`.
         gallery: frames to draw; None: 8 if there are scans.
-        compare: predictions of another detector, which the gallery shows beside.
+        compare: predictions of another detector, for comparison in the gallery.
         errors: also analyze the errors.
         errors_by: rows of the analysis for parts of the data, see `evaluation.errors.error_report.parts_of`.
         beside: errors.json of other evaluations, for the same tables.

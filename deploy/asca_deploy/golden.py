@@ -1,4 +1,4 @@
-"""Golden vectors: what every stage of a bundle takes and gives for one scan, to check a runtime in another language by.
+"""Golden vectors: inputs and outputs of a bundle's stages for one scan, for testing runtimes in other languages.
 
     golden.json                 the bundle, the scan, and of each stage the arrays by name, with their files
     STAGE.NAME.npy              one array each, NumPy's format 1.0, little-endian, C order
@@ -71,7 +71,7 @@ def write_golden(out: Path, bundle: str | Path | None, scan: Path) -> Stages:
 
 
 def golden_stages(pipeline: PillarPipeline | RefinePipeline, points: NDArray[np.float32]) -> Stages:
-    """The arrays of each stage, by stage and name, for the finite points (N, 4), metres, and reflectance within 0..1.
+    """Return the arrays of each stage, by stage and name, for finite points (N, 4), metres, reflectance within 0..1.
 
     Stages, for M points in P pillars: `input`, `pillarize`, `encode`, `scatter` (or `tables` of a sparse neck),
     `neck+head`, `decode` (n boxes above their thresholds) and `suppress` (those that stay). With a second stage, after
@@ -128,7 +128,7 @@ def _detections(found: Detections) -> dict[str, NDArray[Any]]:
 
 
 def _placed(placed: Any) -> dict[str, NDArray[Any]]:
-    """Of a canvas the cells that are not empty: `rows` (n,) of the canvas as (cells, C), and their `values` (n, C)."""
+    """Return placed pillars: of a canvas, the occupied `rows` (n,) of (cells, C) and their `values` (n, C)."""
     if isinstance(placed, Canvas):
         values = placed.image.reshape(-1, placed.image.shape[-1])[placed.occupied]
         return {"rows": placed.occupied.copy(), "values": values}

@@ -1,4 +1,4 @@
-"""What a backend makes of an ONNX graph of a bundle, and whether that is what the bundle says of it."""
+"""ONNX graphs of a bundle in a backend, and the check of their interface against the bundle."""
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -25,11 +25,11 @@ class Session(Protocol):
 
     @property
     def inputs(self) -> Mapping[str, Tensor]:
-        """What the graph declares; an exporter drops inputs that the network does not use."""
+        """Inputs that the graph declares; an exporter drops inputs that the network does not use."""
 
     @property
     def outputs(self) -> Mapping[str, Tensor]:
-        """What the graph returns."""
+        """Outputs of the graph."""
 
     @property
     def run(self) -> Callable[[Sequence[str], Mapping[str, NDArray[Any]]], list[NDArray[Any]]]:
@@ -40,14 +40,14 @@ class Session(Protocol):
 
 
 def first_line(error: Exception) -> str:
-    """What a backend says of a failure, without the lines that follow."""
+    """Return the first line of a backend's error."""
     return (str(error).strip().splitlines() or [type(error).__name__])[0].strip()
 
 
 def check_interface(
     path: Path, session: Session, inputs: Mapping[str, Tensor], outputs: Mapping[str, Tensor]
 ) -> Session:
-    """The session, if its graph takes no other inputs than these and returns these outputs.
+    """Return the session if its graph has these outputs and no other inputs than these.
 
     Raises:
         BundleError: it does not; names the file, the input or output and the remedy.

@@ -42,12 +42,12 @@ _AS_TRAINED = ScanSettings()
 
 @dataclass(frozen=True)
 class ScanTimes:
-    """Time stamps of a recording's scans. Missing are those that would fill the gaps at the usual rate."""
+    """Time stamps of a recording's scans; `missing` scans would fill the gaps at the usual rate."""
 
     seconds: float
-    """From the earliest to the latest."""
+    """Time from the earliest to the latest."""
     rate_hz: float | None
-    """By the median step; None where no two scans follow each other."""
+    """Rate by the median step; None where no two scans follow each other."""
     gaps: int
     missing: int
     longest_gap_s: float
@@ -248,7 +248,7 @@ def _read_files(paths: Sequence[Path], numbers: Iterable[int], scan_input: ScanI
 def _mounting(
     reading: ScanSettings, samples: Iterable[NamedPoints]
 ) -> tuple[Mounting, HeightEstimate | None, str | None]:
-    """The mounting as `reading` says, and the height that the scans show, or why they show none."""
+    """Return the mounting of `reading`, and the height estimated from the scans, or why there is none."""
     try:
         mounting, height = replace(reading, sensor_height="auto").mounting(samples)
     except ScanError as error:
@@ -294,7 +294,7 @@ def _count_inside(points: NDArray[np.float32], ranges: Ranges) -> int:
 
 
 def _scan_times(times: Sequence[tuple[int, int]]) -> ScanTimes:
-    """Of the numbers and time stamps, nanoseconds, of scans in the order of the recording."""
+    """Return the times from numbers and time stamps, nanoseconds, of scans in the order of the recording."""
     numbers, stamps = (np.array(column, np.int64) for column in zip(*times, strict=True))
     steps = np.diff(stamps) / 1e9
     seconds = float(stamps.max() - stamps.min()) / 1e9

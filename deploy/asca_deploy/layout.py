@@ -1,7 +1,7 @@
 """The part of bundle.json that follows from `spec`, written out for readers without our geometry code.
 
-The runtime derives these values itself; a bundle whose written ones differ was edited by hand or made by a
-version whose features or anchors meant something else, and is refused.
+The runtime derives these values itself; a bundle with other written values was edited by hand or made by a version with
+other features or anchors, and is refused.
 """
 
 from typing import Any
@@ -17,7 +17,7 @@ _SAME_M = 1e-6
 
 
 def layout_of(spec: PillarSpec) -> dict[str, Any]:
-    """Plain values for bundle.json.
+    """Return plain values for bundle.json.
 
     x_zones, y_zones: runs of equally sized pillars, ascending: first edge, size and number of pillars.
     canvas_shape: rows and columns of the pseudo-image, the first of each its padding.
@@ -35,7 +35,7 @@ def layout_of(spec: PillarSpec) -> dict[str, Any]:
 
 
 def difference(written: Any, derived: Any) -> str | None:
-    """Path of the first value that differs (metres and radians by more than 1e-6), or None."""
+    """Return the path of the first value that differs (metres and radians by more than 1e-6), or None."""
     if isinstance(derived, dict | list):
         keys = list(derived) if isinstance(derived, dict) else list(range(len(derived)))
         if not isinstance(written, type(derived)) or len(written) != len(derived):

@@ -1,4 +1,4 @@
-"""bundle.json: read, compared with the graphs beside it, and written.
+"""Reading, verifying and writing bundle.json.
 
 A manifest that does not belong to its graphs would move boxes without any error. So everything that boxes depend on
 is also in the metadata of each graph, under the graph's SHA-256, and the two have to agree.
@@ -32,10 +32,10 @@ ESSENTIALS = ("schema_version", "kind", "name", "license", "precision", "spec", 
 """Keys of bundle.json that are stamped into every graph's metadata, each as JSON."""
 
 _ESSENTIALS_OF = {"pillar_refine": (*ESSENTIALS, "refine"), "pv_rcnn": (*ESSENTIALS[:-1], "pv_rcnn")}
-_ESSENTIALS_2 = ("license", "spec", "cpa", "layout")  # of schema 2; 8-bit graphs had the name of the float bundle
-# Of these sections, and of a pillar detector's `spec` and `spec.grid`, and what they are where they are not written: in
-# bundles made before there were sparse necks, scores of both stages, other direction bins and anchors, and pooled maps.
-# Whether they were taken out is told by the graphs' metadata.
+_ESSENTIALS_2 = ("license", "spec", "cpa", "layout")  # schema 2, whose 8-bit graphs had the name of the float bundle
+# Defaults of keys that older bundles lack, in these sections and in a pillar detector's `spec` and `spec.grid`: bundles
+# from before sparse necks, scores of both stages, other direction bins and anchors, and pooled maps. A removed key is
+# detected by the graphs' metadata.
 _LATER_KEYS: dict[str, dict[str, Any]] = {
     "spec": {"direction_offset_rad": DIRECTION_OFFSET_RAD},
     "pillar": {"neck": "dense"},
@@ -47,7 +47,7 @@ _LATER_GRID_KEYS = {"map": "warped"}
 
 
 def load_pillar_bundle(folder: str | Path) -> PillarBundle:
-    """A pillar detector's bundle, with or without a second stage, see `load_bundle`.
+    """Return a pillar detector's bundle, with or without a second stage, see `load_bundle`.
 
     Raises:
         BundleError: as `load_bundle`, or the bundle is of another kind.
@@ -105,7 +105,7 @@ def load_bundle(folder: str | Path) -> Bundle:
 
 
 def _take_out_layout(manifest: Path, data: dict[str, Any]) -> Any:
-    """The layout that a pillar detector's manifest writes down; later keys of `spec` get their first meaning."""
+    """Remove and return the layout of a pillar detector's manifest; later keys of `spec` get their first meaning."""
     if data.get("kind") == "pillar" and "refine" in data:
         raise BundleError(f"{manifest}: `refine` belongs to kind pillar_refine, this is pillar; {EXPORT_AGAIN}")
     layout = None
@@ -117,7 +117,7 @@ def _take_out_layout(manifest: Path, data: dict[str, Any]) -> Any:
 
 
 def upgrade_schema_2(data: dict[str, Any]) -> dict[str, Any]:
-    """The manifest of a bundle of schema 2 as schema 3 would have written it; what makes no sense stays so.
+    """Convert the manifest of a bundle of schema 2 to schema 3; invalid values stay.
 
     Schema 2 knew pillar detectors alone, measured the expected input on the scans given to the export, and did not
     say whether the model was trained on the camera's view; `asca eval` took it for granted.
@@ -146,7 +146,7 @@ def write_bundle_manifest(folder: str | Path, bundle: Bundle) -> None:
 
 
 def bundle_to_json(bundle: Bundle) -> dict[str, Any]:
-    """What bundle.json holds: the bundle's fields, and the layout that readers in other languages need."""
+    """Return the content of bundle.json: the bundle's fields, and the layout that other languages' readers need."""
     data = {"schema_version": bundle.schema_version, **to_dict(bundle)}
     if isinstance(bundle, PillarBundle):
         data["pillar"]["layout"] = layout_of(bundle.spec)
@@ -156,13 +156,13 @@ def bundle_to_json(bundle: Bundle) -> dict[str, Any]:
 
 
 def essentials(bundle: Bundle) -> dict[str, Any]:
-    """What the export stamps into the metadata of each graph, see ESSENTIALS."""
+    """Return the fields that the export stamps into the metadata of each graph, see ESSENTIALS."""
     data = bundle_to_json(bundle)
     return {key: data[key] for key in _stamped_keys(data)}
 
 
 def graph_files(folder: str | Path, names: Iterable[str] = PILLAR_GRAPHS) -> dict[str, GraphFile]:
-    """The graphs of these names as they lie in `folder`, such as encoder.onnx and backbone.onnx."""
+    """Return the graphs of these names as they lie in `folder`, such as encoder.onnx and backbone.onnx."""
     files = {name: f"{name}.onnx" for name in names}
     return {name: GraphFile(file, _sha256((Path(folder) / file).read_bytes())) for name, file in files.items()}
 

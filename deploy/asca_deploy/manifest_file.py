@@ -1,4 +1,4 @@
-"""bundle.json as a file: its JSON, before a bundle is made of it; and whether every value was taken as written."""
+"""bundle.json as a file: reading its JSON, and checking that every value was taken as written."""
 
 import json
 import reprlib
@@ -18,7 +18,7 @@ _LARGEST_BYTES = 1 << 20
 
 
 def read_manifest(manifest: Path) -> dict[str, Any]:
-    """The keys and values of a bundle.json of a schema that this version reads; BundleError if it is none."""
+    """Read the keys and values of a bundle.json of a supported schema; BundleError if it is none."""
     try:
         require_content(manifest, BundleError)
         if manifest.stat().st_size > _LARGEST_BYTES:
@@ -34,7 +34,7 @@ def read_manifest(manifest: Path) -> dict[str, Any]:
         raise BundleError(f"{manifest}: {error.strerror}") from None
     except RecursionError:
         raise BundleError(f"{manifest} is damaged (nested too deeply); {EXPORT_AGAIN}") from None
-    except ValueError as error:  # of the JSON, or of its UTF-8
+    except ValueError as error:  # invalid JSON or UTF-8
         raise BundleError(f"{manifest} is damaged ({printable(str(error), LONGEST_REASON)}); {EXPORT_AGAIN}") from None
     version = data.get("schema_version") if isinstance(data, dict) else None
     if type(version) is not int:
@@ -51,7 +51,7 @@ def read_manifest(manifest: Path) -> dict[str, Any]:
 
 
 def first_misread(written: Any, understood: Any) -> str | None:
-    """Path of the first value that was not taken as it is written, such as true for 1 or a default; or None.
+    """Return the path of the first value that was not taken as it is written, such as true for 1 or a default; or None.
 
     A key that is understood as None need not be written: bundles made before there was such a key lack it.
     """

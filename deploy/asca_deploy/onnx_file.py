@@ -1,7 +1,7 @@
-"""What the runtime must know of an ONNX file before a backend opens it, read without the package `onnx`.
+"""Checks of an ONNX file before a backend opens it, read without the package `onnx`.
 
-The file is a protobuf message (https://github.com/onnx/onnx/blob/main/onnx/onnx.proto); only the few fields below
-are looked at, everything else is stepped over.
+The file is a protobuf message (https://github.com/onnx/onnx/blob/main/onnx/onnx.proto); only the few fields below are
+read, others are skipped.
 """
 
 from collections.abc import Iterator
@@ -28,7 +28,7 @@ _WAYS_TO_TENSORS = {
 
 
 def read_metadata(model: bytes) -> dict[str, str]:
-    """The `metadata_props` of a model.
+    """Return the `metadata_props` of a model.
 
     Raises:
         ValueError: this is no ONNX file.
@@ -42,7 +42,7 @@ def read_metadata(model: bytes) -> dict[str, str]:
 
 
 def has_external_data(model: bytes) -> bool:
-    """Whether any tensor of a model lies in another file.
+    """Return whether any tensor of a model lies in another file.
 
     Raises:
         ValueError: this is no ONNX file.
@@ -67,7 +67,7 @@ def _leads_outside(message: _Message, kind: str, depth: int) -> bool:
 
 
 def _fields(message: _Message) -> Iterator[tuple[int, int | memoryview]]:
-    """Number and value of each field: an int, or the bytes of a string, a packed list or a message."""
+    """Yield number and value of each field: an int, or the bytes of a string, a packed list or a message."""
     place = 0
     while place < len(message):
         tag, place = _varint(message, place)
@@ -89,7 +89,7 @@ def _fields(message: _Message) -> Iterator[tuple[int, int | memoryview]]:
 
 
 def _varint(message: _Message, place: int) -> tuple[int, int]:
-    """The number that starts at `place`, and where it ends."""
+    """Return the number that starts at `place`, and where it ends."""
     value = 0
     for shift in range(0, 70, 7):
         if place >= len(message):

@@ -1,4 +1,4 @@
-"""onnxruntime, which is imported here and nowhere else: its reports to its maker are off by then."""
+"""The only import of onnxruntime, after its telemetry has been disabled."""
 
 from asca_pillars.base.telemetry import disable_telemetry, onnxruntime_may_report
 

@@ -1,4 +1,4 @@
-"""A model that is to be run over a split: a bundle in ONNX Runtime, or a checkpoint in PyTorch."""
+"""Models to run over a split: a bundle in ONNX Runtime, or a checkpoint in PyTorch."""
 
 import logging
 from dataclasses import dataclass
@@ -39,7 +39,7 @@ def open_detector(
     *,
     around: bool = False,
 ) -> Detector:
-    """The detector of a bundle that is run as `options` say, from `score` on; None for the bundle's own thresholds.
+    """Open the detector of a bundle as `options` say, from `score` on; None for the bundle's own thresholds.
 
     Raises:
         AscaError: as `asca_deploy.Detector`.
@@ -56,11 +56,11 @@ def open_detector(
 
 
 def track_thresholds(bundle: str | Path | None, score: ScoreThresholds | None = None) -> tuple[dict[str, float], float]:
-    """The scores from which on detections of each class begin tracks, and from which on the detector is to report.
+    """Return the scores from which on detections of each class begin tracks, and are reported by the detector.
 
     Args:
         bundle: of the detector; None: the one that ships.
-        score: from which on boxes are wanted, or by class; None: the thresholds of the model.
+        score: lowest score of boxes, or by class; None: the thresholds of the model.
 
     Returns:
         `Tracker`'s birth_score, and the detector's score threshold: WEAK_SHARE of the lowest of these.
@@ -83,10 +83,10 @@ def open_model(
         options: which one, and how it runs.
         min_score: lowest score of what it reports.
         sensor_height_m: of the scans; None: as high as in the training.
-        around: look in every direction, by turned passes.
+        around: detect in every direction, see `asca_deploy.around`.
 
     Raises:
-        AscaError: missing, damaged, or not to be run as asked; one line.
+        AscaError: missing, damaged, or not runnable with these options; one line.
     """
     path = None if options.bundle is None else Path(options.bundle)
     if path is not None and (path.is_file() or path.suffix == ".ckpt"):

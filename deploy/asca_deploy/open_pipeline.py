@@ -1,4 +1,4 @@
-"""Which pipeline runs a bundle, by its family, and on which provider."""
+"""Choice of the pipeline for a bundle, by its family, and of its provider."""
 
 from pathlib import Path
 from typing import Any, Literal
@@ -21,7 +21,7 @@ def open_pipeline(
     precision: providers.Precision | None,
     threads: int,
 ) -> auto.Choice[Pipeline[Any, Any]]:
-    """The pipeline of a bundle's family, on the provider of that name or, with auto, on the fastest that agrees.
+    """Open the pipeline of a bundle's family on a provider or, with auto, on the fastest that agrees.
 
     Args:
         folder: of the bundle.
@@ -30,7 +30,7 @@ def open_pipeline(
         precision: None for float32, with auto for any.
 
     Raises:
-        BundleError: a graph cannot be run or is not what the manifest says.
+        BundleError: a graph cannot be run or does not match the manifest.
         ProviderError: the provider does not start or cannot run the graph; with auto, none can be taken.
     """
 

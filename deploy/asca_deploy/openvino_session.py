@@ -39,7 +39,7 @@ def require(precision: str) -> None:
 
 
 def describe() -> str:
-    """The installed OpenVINO and what it runs on; `require` must have found it."""
+    """Describe the installed OpenVINO and its device; `require` must have found it."""
     bfloat16 = "with bfloat16" if _has_bfloat16() else "without bfloat16"
     return f"OpenVINO {_import_openvino().__version__.split('-')[0]} on {_device_name()} {bfloat16}"
 
@@ -103,7 +103,7 @@ class OpenVinoSession:
 
 
 def _last_line(error: RuntimeError) -> str:
-    """The last line of what OpenVINO says, which says the most."""
+    """Return the last line of OpenVINO's message, the most specific one."""
     return (str(error).strip().splitlines() or [type(error).__name__])[-1].strip()
 
 
@@ -138,7 +138,7 @@ def _core() -> "openvino.Core":
 def _import_openvino() -> Any:
     """Import the package without its report to the manufacturer.
 
-    It sends one at every import, unless the package that does so cannot be imported; a vehicle must not report.
+    It sends one at every import unless its telemetry package cannot be imported.
     """
     telemetry = "openvino_telemetry"
     absent = telemetry not in sys.modules

@@ -33,7 +33,7 @@ class OrtProvider:
         ort_name: onnxruntime's name for it.
         remedy: what the user can do to get it.
         options: handed to onnxruntime, by precision; a precision that is not there cannot be had.
-        helpers: providers that take the operators this one does not know, before the CPU does.
+        helpers: providers for operators that this one does not support, before the CPU.
     """
 
     ort_name: str

@@ -1,4 +1,4 @@
-"""What a family of detectors has to bring along to be run by `Detector`."""
+"""Interface between `Detector` and the families of detectors."""
 
 from collections.abc import Sequence
 from typing import Any, Protocol, TypeAlias, TypeVar
@@ -14,11 +14,11 @@ end before it; a name may come twice."""
 
 
 class Prepared(Protocol):
-    """A scan on its way into the network."""
+    """A scan's input for the slowest network."""
 
     @property
     def counts(self) -> ScanCounts:
-        """What became of its points."""
+        """Counts of the scan's points."""
 
 
 P = TypeVar("P", bound=Prepared)
@@ -26,14 +26,14 @@ R = TypeVar("R")
 
 
 class Pipeline(Protocol[P, R]):
-    """The way from points to boxes, in three parts that `Detector.stream` runs at once for different scans.
+    """Interface of a family's pipeline: three parts that `Detector.stream` runs concurrently on different scans.
 
-    What belongs to one scan travels in the arguments and results, so that several threads may be in one pipeline.
-    Each part appends the stages that it is through with to `laps`.
+    A scan's state is in arguments and results alone, so that several threads may use one pipeline. Each part appends
+    its finished stages to `laps`.
     """
 
     spec: Any
-    """The bundle's numbers; the same with other score thresholds may be put in their place."""
+    """Spec of the bundle; may be replaced by one with other score thresholds."""
 
     @property
     def stages(self) -> Sequence[str]:
@@ -41,13 +41,13 @@ class Pipeline(Protocol[P, R]):
 
     @property
     def network_stages(self) -> Sequence[str]:
-        """Those of them that are spent in graphs."""
+        """Names of the stages that run a graph."""
 
     def prepare(self, points: NDArray[np.float32], laps: Laps) -> P:
-        """(N, 4) finite x, y, z in metres, LiDAR frame, and reflectance 0..1 -> the input of the slowest network."""
+        """Prepare the slowest network's input: (N, 4) finite x, y, z in metres, LiDAR frame, reflectance 0..1."""
 
     def infer(self, prepared: P, laps: Laps) -> R:
         """Run the slowest network; each prepared scan may be given once."""
 
     def finish(self, raw: R, laps: Laps) -> Detections:
-        """What the network answered -> boxes."""
+        """Decode the network's output into boxes."""

@@ -1,4 +1,4 @@
-"""Which hardware the backbone runs on, through which library and in which precision.
+"""Providers of the backbone: hardware, library and precision.
 
     cpu       onnxruntime, always there
     cuda      onnxruntime's GPU build
@@ -9,7 +9,7 @@
 faster: bfloat16 in OpenVINO, TF32 in CUDA, float16 in TensorRT. In an int8 bundle both concern only what the export
 left in floating point.
 
-A provider that was asked for and cannot run is an error, never a silent fallback to the CPU.
+A requested provider that cannot run is an error; there is no silent fallback to the CPU.
 """
 
 from pathlib import Path
@@ -28,7 +28,7 @@ AUTO: Literal["auto"] = "auto"
 
 
 def arithmetic(weights: str, precision: str) -> str:
-    """What a network computes in, in words.
+    """Return the arithmetic of a network in words.
 
     Args:
         weights: the bundle's own precision, float32 or int8.
@@ -42,7 +42,7 @@ def arithmetic(weights: str, precision: str) -> str:
 def require(provider: str, precision: str = "float32") -> None:
     """Raise ProviderError, one line with the remedy, unless the provider is installed and has the precision.
 
-    AUTO always is; what it has shows when it looks.
+    AUTO always passes; its candidates are checked when they are opened.
     """
     if provider not in (AUTO, *PROVIDERS):
         raise ProviderError(f"unknown provider {provider!r}; choose one of {AUTO}, {', '.join(PROVIDERS)}")
@@ -55,7 +55,7 @@ def require(provider: str, precision: str = "float32") -> None:
 
 
 def available() -> list[tuple[Provider, Precision]]:
-    """Every (provider, precision) that is installed; the faster precision of a provider first."""
+    """Return every (provider, precision) that is installed; the faster precision of a provider first."""
     found: list[tuple[Provider, Precision]] = []
     for provider in PROVIDERS:
         for precision in reversed(PRECISIONS):

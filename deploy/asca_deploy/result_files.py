@@ -45,7 +45,7 @@ KITTI_FILE = "tracks.txt"
 UNREADABLE_FILE = "unreadable.jsonl"
 INDEX_FILE = "index.html"
 MISSED_IOU = 0.1
-"""A label that no box overlaps so far, seen from above, counts as missed on the page of pictures."""
+"""BEV IoU below which a label counts as missed on the page of pictures."""
 
 
 def _is_kitti_text(path: Path) -> bool:
@@ -124,7 +124,7 @@ class ResultWriter:
         self._written: set[str] = set()
         self._lines: IO[str] | None = None
         self.remarks: list[str] = []
-        """What could not be drawn or written, and why; for the user."""
+        """Messages for the user on what could not be drawn or written."""
 
     def __enter__(self) -> "ResultWriter":
         self._written = {f"{name.as_posix()}{ending}" for name in self._names for ending in _OF_A_SCAN}
@@ -157,7 +157,7 @@ class ResultWriter:
         tracks: Tracks | None = None,
         time_ns: int | None = None,
     ) -> None:
-        """NAME.json and NAME_bev.png; with a KITTI calibration NAME.txt, with an image NAME_image.png too.
+        """Write NAME.json and NAME_bev.png; with a KITTI calibration NAME.txt, with an image NAME_image.png too.
 
         Those of them that an earlier run wrote, and this one does not, are removed if the boxes are others now.
         `tracks` are of the same boxes; the time is written if it is given.
@@ -187,7 +187,7 @@ class ResultWriter:
             self._named(name, ending).unlink(missing_ok=True)
 
     def _page(self) -> str:
-        """The page of all pictures."""
+        """Return the page of all pictures."""
         has_labels = any("missed" in card.values for card in self._cards)
         introduction = "Boxes seen from above, with their scores; ahead of the sensor is up."
         if has_labels:
@@ -270,18 +270,18 @@ def _card(
 
 
 def _write_kitti(path: Path, detections: ScanDetections, calibration: Calibration, image: Any) -> None:
-    """What the camera sees, as KITTI's tools want it: they know no boxes outside the image."""
+    """Write the detections in the camera's image in KITTI's format, whose tools take no others."""
     size_wh = None if image is None else (image.shape[1], image.shape[0])
     write_text(path, detections.to_kitti(calibration, size_wh))
 
 
 def as_line(content: dict[str, Any]) -> str:
-    """A line of `detections.jsonl`, with its end."""
+    """Return a line of `detections.jsonl`, with its end."""
     return json.dumps(content) + "\n"
 
 
 def scan_content(path: Path, scan: Scan, detections: ScanDetections, scope: DetectorScope) -> dict[str, Any]:
-    """What is written of one scan, as plain values; `path` names it, `scope` is the detector's."""
+    """Return the content of one scan as plain values; `path` names it, `scope` is the detector's."""
     report, notes = detections.report, scan.notes
     return {
         "scan": str(path),

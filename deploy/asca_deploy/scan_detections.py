@@ -1,4 +1,4 @@
-"""The result of a detector: the boxes of one scan with its report, as a picture, a table or KITTI text."""
+"""Result of a detector: the boxes of one scan with its report, as a picture, a table or KITTI text."""
 
 import base64
 import html
@@ -17,21 +17,21 @@ from asca_pillars.geometry.ranges import Ranges
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ScanDetections(Detections):
-    """What a `Detector` found in one scan; a part of them, by mask or slice, has the same report."""
+    """Detections of a `Detector` in one scan; a part of them, by mask or slice, has the same report."""
 
     report: FrameReport = field(kw_only=True)
     """Times, counters and warnings of the scan."""
     ranges: Ranges = field(kw_only=True)
-    """Where the detector looked, level frame."""
+    """Ranges of the detector, level frame."""
     level: FrameChange | None = field(default=None, kw_only=True)
-    """From the frame of the boxes to a level one, x forward, y left, z up; None: it is such a one."""
+    """Change from the frame of the boxes to a level one, x forward, y left, z up; None if it is level already."""
     source: Callable[[], NDArray[Any] | None] | None = field(default=None, kw_only=True)
     """Weak reference to the points (N, >=3) that the boxes were found in."""
     made_by: Mapping[str, str] = field(default_factory=dict, kw_only=True)
     """The model, its weights' digest and the version, `Detector.made_by`."""
 
     def __getstate__(self) -> dict[str, Any]:
-        """Copied or sent to another process, they come without the points."""
+        """Return the state without the points, for copies and other processes."""
         return self.__dict__ | {"source": None}
 
     @property
@@ -41,7 +41,7 @@ class ScanDetections(Detections):
         return np.arctan2(level[:, 1], level[:, 0])
 
     def to_kitti(self, calibration: Calibration, image_size_wh: tuple[int, int] | None = None) -> str:
-        """KITTI text with scores, one line for each box that the camera sees.
+        """Return KITTI text with scores, one line for each box that the camera sees.
 
         Args:
             calibration: from `asca_pillars.data.kitti.read_calibration`.
@@ -59,13 +59,13 @@ class ScanDetections(Detections):
         labels: NDArray[np.floating] | None = None,
         width_px: int = 1000,
     ) -> NDArray[np.uint8]:
-        """The scan and the boxes as an image (H, width_px, 3), blue, green, red as in OpenCV.
+        """Draw the scan and the boxes as an image (H, width_px, 3), blue, green, red as in OpenCV.
 
         A notebook shows it as a picture.
 
         Args:
             points: (N, >=3) x, y, z in metres, LiDAR frame. None for those that the boxes were found in: only a weak
-                reference to them is kept, so they are drawn as long as somebody else keeps the array.
+                reference to them is kept, so they are drawn as long as the caller keeps the array.
             view: "above", where ahead is up, or "chase", in 3D from behind the sensor.
             labels: (M, 7) true boxes in the scan's frame, drawn thin and white; None without any.
             width_px: of the image.
@@ -96,7 +96,7 @@ class ScanDetections(Detections):
         return self.boxes if self.level is None else self.level.boxes(self.boxes)
 
     def _repr_html_(self) -> str:
-        """A notebook's view: the picture if the points are still there, and the boxes as a table."""
+        """Return a notebook's view: the picture if the points are still there, and the boxes as a table."""
         rows = "".join(
             f"<tr><td>{html.escape(found.class_name)}</td><td>{found.score:.2f}</td><td>{found.x_m:.1f}</td>"
             f"<td>{found.y_m:.1f}</td><td>{found.length_m:.1f} x {found.width_m:.1f} x {found.height_m:.1f}</td>"
@@ -110,7 +110,7 @@ class ScanDetections(Detections):
         return f"<div>{picture}<table><tr>{head}</tr>{rows}</table></div>"
 
     def _repr_png_(self) -> bytes | None:
-        """The picture for a notebook; None if the points are gone."""
+        """Return the picture for a notebook; None if the points are gone."""
         if self._points() is None:
             return None
         from asca_pillars.pictures.visualize import png_bytes

@@ -1,4 +1,4 @@
-"""Scans that come when they like, for a detector that takes them when it can.
+"""Queue of scans from a sensor's thread to a detector.
 
 queue = ScanQueue(when_full="drop")
 lidar.on_scan = queue.put            # in the sensor's thread
@@ -20,10 +20,10 @@ WhenFull: TypeAlias = Literal["drop", "wait"]
 
 
 class ScanQueue:
-    """Between a sensor's thread, which calls `put`, and `Detector.stream`, which iterates. For one of each.
+    """Queue between a sensor's thread, which calls `put`, and `Detector.stream`, which iterates. One of each.
 
     A stream takes up to two scans ahead of the one that it hands out; those are no longer in the queue. After a stream
-    that failed or was left, a new one over the same queue goes on with the scans that wait.
+    that failed or was left, a new one over the same queue continues with the waiting scans.
 
     Args:
         when_full: what a scan does that finds the queue full. "drop": the oldest waiting scan is dropped and counted,
@@ -53,7 +53,7 @@ class ScanQueue:
         self.dropped = self.taken = 0
 
     def put(self, points: NDArray[Any], tag: Any = None) -> bool:
-        """Hand in a scan; whether it was taken into the queue, which it is unless the queue was closed.
+        """Put a scan into the queue; return False only if the queue was closed.
 
         Args:
             points: (N, 4) as for `Detector`, x, y, z in metres and reflectance; not to be written to afterwards.
@@ -72,19 +72,19 @@ class ScanQueue:
             return True
 
     def close(self) -> None:
-        """No more scans: those that wait are handed out, then the iterator ends. `put` returns False from here on."""
+        """Close the queue: waiting scans are handed out, then the iterator ends. `put` returns False from here on."""
         with self._changed:
             self._closed = True
             self._changed.notify_all()
 
     def interrupt(self) -> None:
-        """End the iterator that is under way; what waits stays for the next one. A stream that is left calls it."""
+        """End the current iterator; waiting scans stay for the next one. A stream that is closed calls it."""
         with self._changed:
             self._stream += 1
             self._changed.notify_all()
 
     def next_tag(self) -> Any:
-        """The tag of the oldest scan that was handed out: call it once for each result of the stream.
+        """Return the tag of the oldest scan that was handed out: call it once for each result of the stream.
 
         None for a scan that was put without one, so that scans with and without tags keep their places. Tags that are
         never asked for are kept until the next stream begins; it starts with its own first scan.

@@ -1,4 +1,4 @@
-"""What comes with the package, by name: bundles and a scan; and where a bundle is that a user names."""
+"""Bundles and the scan that come with the package, by name; lookup of a bundle that a user names."""
 
 import hashlib
 from importlib import resources
@@ -14,18 +14,18 @@ from asca_pillars.base.input_files import require_content
 
 
 def default_bundle_path() -> Path:
-    """Folder of the model that is used unless another is named: 8-bit, the faster one on every CPU."""
+    """Return the folder of the default model: 8-bit, the faster one on every CPU."""
     return shipped_bundles()["asca_sim_int8"]
 
 
 def shipped_bundles() -> dict[str, Path]:
-    """Folders of the models that come with the package, by name."""
+    """Return the folders of the models that come with the package, by name."""
     folders = Path(str(resources.files("asca_deploy") / "bundles")).iterdir()
     return {folder.name: folder for folder in sorted(folders) if (folder / MANIFEST).is_file()}
 
 
 def find_bundle(bundle: str | Path | None) -> Path:
-    """The folder meant by a path, by the name of a bundle that ships, or by None.
+    """Return the folder for a path, for the name of a bundle that ships, or for None.
 
     Raises:
         BundleError: there is neither.
@@ -44,7 +44,7 @@ def find_bundle(bundle: str | Path | None) -> Path:
 
 
 def find_weights(bundle: str | Path) -> Path:
-    """The checkpoint that a bundle (folder, or name of one that ships) holds beside its graphs.
+    """Return the checkpoint that a bundle (folder, or name of one that ships) holds beside its graphs.
 
     Raises:
         BundleError: there is no such bundle, it is damaged, it holds none, or another one than it was exported with.
@@ -67,7 +67,7 @@ def find_weights(bundle: str | Path) -> Path:
 
 
 def find_checkpoint(source: str | Path) -> Path:
-    """A checkpoint itself, by its suffix, or the one that a bundle (folder, or name of one that ships) holds.
+    """Return a checkpoint itself, by its suffix, or the one that a bundle (folder, or name of one that ships) holds.
 
     Raises:
         BundleError: as `find_weights`.
@@ -77,7 +77,7 @@ def find_checkpoint(source: str | Path) -> Path:
 
 
 def sample_scan_path() -> Path:
-    """The simulated scan that comes with the package, KITTI .bin."""
+    """Return the simulated scan that comes with the package, KITTI .bin."""
     return Path(str(resources.files("asca_deploy") / "samples" / "street.bin"))
 
 

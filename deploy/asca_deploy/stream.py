@@ -1,10 +1,10 @@
-"""Scan after scan with the network never waiting: one scan in it, the next on its way to it, the one before decoded.
+"""Pipelining of scans: one in the network, the next being prepared, the one before being decoded.
 
     caller      decode 1 | decode 2 | decode 3        boxes are handed out
     network       net 2  |  net 3   |  net 4
     host         scan 3  | scan 4   | scan 5          read, and prepared on memory of its own
 
-There are more scans per second than one after the other, and each is a little later, for it waits for the one before.
+More scans per second are processed than one after the other, each with a little more latency.
 """
 
 import atexit
@@ -27,11 +27,11 @@ def overlapped(
     infer: Callable[[Ready], Maps],
     finish: Callable[[Maps], Result],
 ) -> Generator[Result, None, None]:
-    """`finish(infer(prepare(scan)))` of each scan, in order; the three run at once, for different scans.
+    """Yield `finish(infer(prepare(scan)))` of each scan, in order; the three run concurrently on different scans.
 
     `scans` is read in a thread of its own, so that reading files or waiting for a sensor overlaps too, and never more
     than one scan ahead of the one that is asked for. Closing the iterator waits for the stages that run, and for the
-    scan if one is being read, and ends both threads. A source that may wait for ever has a method `interrupt`, which is
+    scan if one is being read, and ends both threads. A source that may block forever has a method `interrupt`, which is
     called first and lets its iterator end (`scan_queue.ScanQueue`). A program that ends with an open stream waits for
     the stages that run and for no scan.
 
@@ -55,10 +55,10 @@ def overlapped(
 
 
 class _Ahead(Generic[Scan, Ready, Maps]):
-    """Two threads, each of which does its own stage of scan after scan.
+    """Two daemon threads, one for `prepare` and one for `infer`.
 
-    They are daemons: the interpreter joins other threads before it closes what is still open, and a source that waits
-    for ever would then never be interrupted.
+    Daemons, because the interpreter joins other threads before `atexit` functions run, and a source that blocks could
+    then not be interrupted.
     """
 
     def __init__(self, scans: Iterable[Scan], prepare: Callable[[Scan], Ready], infer: Callable[[Ready], Maps]) -> None:
@@ -87,13 +87,13 @@ class _Ahead(Generic[Scan, Ready, Maps]):
         self._network.join()
 
     def start(self) -> "Future[tuple[Maps, ...]]":
-        """Begin with the next scan; the future holds what `infer` makes of it, or nothing if there is no scan left."""
+        """Begin with the next scan; the future's result is empty if there is no scan left."""
         future: Future[tuple[Maps, ...]] = Future()
         self._asked.put(future)
         return future
 
     def leave(self) -> None:
-        """Let no stage begin any more, and wait for those that run: at the program's end their libraries go away."""
+        """Start no further stages and wait for those that run, as libraries are unloaded at exit."""
         self._left = True
         interrupt = getattr(self._source, "interrupt", None)
         if interrupt is not None:

@@ -1,9 +1,9 @@
-"""From boxes of single scans to objects that last: constant velocity, one-to-one matching, births and deaths by score.
+"""Multi-object tracking: constant velocity, one-to-one matching, births and deaths by score.
 
 Each track is a Kalman filter over position and velocity on the ground, with white acceleration (Bar-Shalom, Li,
-Kirubarajan, Estimation with Applications to Tracking and Navigation, 6.3); x and y share one covariance, for neither
-motion nor measurement prefers an axis. How sure a track is of its existence is a score that detections raise and time
-lowers (Benbarka et al., Score refinement for confidence-based 3D multi-object tracking, IROS 2021).
+Kirubarajan, Estimation with Applications to Tracking and Navigation, 6.3); x and y share one covariance, as motion and
+measurement are isotropic. The confidence of a track is a score that detections raise and time lowers (Benbarka et al.,
+Score refinement for confidence-based 3D multi-object tracking, IROS 2021).
 """
 
 from collections.abc import Mapping
@@ -23,31 +23,31 @@ from asca_pillars.geometry.overlap import paired_bev_intersection
 _Doubles = NDArray[np.float64]
 _Integers = NDArray[np.int64]
 
-MEASURED_SIGMA_M = 0.2  # of a box's center, on either axis
+MEASURED_SIGMA_M = 0.2  # standard deviation of a box's center, on either axis
 # Sigma of an object's first velocity per metre of its length, and its bounds, m/s: people are slow and short.
 FIRST_SPEED_PER_M, FIRST_SPEED_MPS = 4.0, (2.0, 12.0)
 ACCELERATION_MPS2 = 3.0
 GATE = 9.21  # squared distance over its variance: 99 % of a track's own detections in the plane
-FADE_PER_S = 1.0  # of a track's score that nothing confirms
-MAX_SCORE = 0.98  # so that the best tracks end, too
-MAX_SCAN_GAP_S = 2.0  # between two scans of one drive
+FADE_PER_S = 1.0  # decay of an unconfirmed track's score
+MAX_SCORE = 0.98  # upper bound, so that the best tracks end too
+MAX_SCAN_GAP_S = 2.0  # largest gap between two scans of one drive
 WEAK_SHARE = 0.7
-"""Detections from this share of the lowest threshold on carry tracks on that better ones began."""
-MAX_UNLOOKED_FADE_S = 0.2  # of the time until the first scan after a detection, in which nobody looked
+"""Share of the lowest threshold from which on detections continue tracks that better ones began."""
+MAX_UNLOOKED_FADE_S = 0.2  # longest decay of a track that the scan before confirmed
 
 
 @dataclass
 class _State:
-    """T tracks in the frame that stands still; what is a row here is a row everywhere."""
+    """State of T tracks in the fixed frame; rows of the arrays correspond."""
 
     ids: _Integers
     labels: _Integers
     boxes: _Doubles
-    """(T, 7) of the last detection, moved to where it should be now."""
+    """(T, 7) boxes of the last detections, predicted to the current time."""
     velocities: _Doubles
     """(T, 2)."""
     covariance: _Doubles
-    """(T, 3) variance of the position, covariance, variance of the velocity; of x and of y alike."""
+    """(T, 3) variance of the position, covariance, variance of the velocity; the same for x and y."""
     scores: _Doubles
     unseen_s: _Doubles
 
@@ -62,15 +62,15 @@ class _State:
 
 
 class Tracker:
-    """Gives the boxes of scan after scan identities and velocities. One per sensor; not for several threads.
+    """Tracker of multiple objects: assigns identities and velocities to boxes. One per sensor; not thread-safe.
 
-    Detections of low score are worth having: they carry on a track that a better one began. Give the tracker a
-    detector with a lower `score_threshold` than the scores that shall begin tracks.
+    Detections of low score continue tracks that better ones began: the detector's `score_threshold` should be below
+    `birth_score`.
 
     Args:
         birth_score: a detection that no track takes begins one from this score on; one number, or one for each class
             name. With several classes, those that are not named take the lowest.
-        report_score: a track is reported from this score on: at once if it begins so well, else after a second look.
+        report_score: a track is reported from this score on: at once if it begins there, else after later detections.
         death_score: a track ends below it. Unseen, it loses `FADE_PER_S` of its score per second.
         max_unseen_s: a track that nothing confirmed for so long ends, whatever its score. One that the last scan
             confirmed waits for this scan, if the two are at most `MAX_SCAN_GAP_S` apart.
@@ -100,7 +100,7 @@ class Tracker:
         self.reset()
 
     def reset(self) -> None:
-        """Forget all tracks, as before another drive. Numbers go on."""
+        """Drop all tracks, as before another drive; numbers of tracks are not reused."""
         self._state = _empty()
         self._time_s: float | None = None
         self._origin: _Doubles | None = None
@@ -150,7 +150,7 @@ class Tracker:
         return Tracks(detections[reported], self._state.ids[rows], velocities)
 
     def _predict(self, elapsed_s: float) -> None:
-        """Move all tracks on, and drop those that faded."""
+        """Predict all tracks, and drop those whose score has faded."""
         state = self._state
         seen = (state.unseen_s == 0) & (elapsed_s <= MAX_SCAN_GAP_S)
         state.scores = state.scores - FADE_PER_S * np.where(seen, min(elapsed_s, MAX_UNLOOKED_FADE_S), elapsed_s)
@@ -164,7 +164,7 @@ class Tracker:
         self._state = state
 
     def _match(self, boxes: _Doubles, labels: _Integers) -> _Integers:
-        """The row of the track that each detection (N, 7) belongs to, or UNMATCHED."""
+        """Return for each detection (N, 7) the row of its track, or UNMATCHED."""
         state = self._state
         if not len(state) or not len(boxes):
             return np.full(len(boxes), UNMATCHED)
@@ -183,7 +183,7 @@ class Tracker:
         return row_of
 
     def _update(self, rows: _Integers, boxes: _Doubles, scores: _Doubles) -> None:
-        """Correct tracks by the detections (N, 7) that they took."""
+        """Correct tracks by their matched detections (N, 7)."""
         state = self._state
         place, both, speed = state.covariance[rows].T
         gain_place = place / (place + MEASURED_SIGMA_M**2)

@@ -1,4 +1,4 @@
-"""The result of tracking: the boxes of one scan with identities and velocities."""
+"""Result of tracking: the boxes of one scan with identities and velocities."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ _DIGITS = 4
 
 
 class Track(NamedTuple):
-    """One tracked box: what was detected, whose it is, and how fast that moves along the scan's x and y."""
+    """One tracked box: detection, identity, and velocity along the scan's x and y."""
 
     track_id: int
     detection: Detection
@@ -28,9 +28,9 @@ class Tracks:
     detections: Detections
     """N boxes as they were detected, in the frame of the scan."""
     track_ids: NDArray[np.int64]
-    """(N,) the same number for the same object, from scan to scan; numbers are never used again."""
+    """(N,) identity of each object, the same from scan to scan; numbers are never reused."""
     velocities_mps: NDArray[np.float64]
-    """(N, 2) along the scan's x and y: over ground where the tracker knows the car's pose, else as the car sees it."""
+    """(N, 2) along the scan's x and y: over ground if the tracker gets the vehicle's pose, else relative to it."""
 
     def __len__(self) -> int:
         return len(self.detections)
@@ -42,7 +42,7 @@ class Tracks:
             yield Track(number, found, vx, vy)
 
     def to_dicts(self) -> list[dict[str, str | float]]:
-        """`Detections.to_dicts` with `track_id`, `vx_mps` and `vy_mps` in each."""
+        """Return `Detections.to_dicts` with `track_id`, `vx_mps` and `vy_mps` in each."""
         return [
             found
             | {"track_id": track.track_id, "vx_mps": round(track.vx_mps, _DIGITS)}

@@ -1,4 +1,4 @@
-"""Scans and their boxes in the browser's page, served to this computer alone: detection runs here, in Python.
+"""Local web page of scans and their boxes; detection runs in Python, and only this computer is served.
 
 The page is that of `browser_page` without its detector: it asks for the points of a scan, shows them, and asks for the
 boxes. Only fixed paths are answered, only requests that name this computer as their host, so that a page of somebody
@@ -36,7 +36,7 @@ from asca_pillars.scans.scan_settings import ScanSettings
 
 HOST = "127.0.0.1"
 LOWEST_SCORE = 0.1
-"""That the page's sliders reach where one pass looks everywhere: in the merging of several, low boxes remove others."""
+"""Lowest end of the page's score sliders with a single pass; in merging several, low boxes would remove others."""
 _TYPES = {
     ".html": "text/html; charset=utf-8",
     ".css": "text/css; charset=utf-8",
@@ -58,7 +58,7 @@ _AS_TRAINED = ScanSettings()
 
 
 class ScanServer:
-    """The page of some scans on a port of this computer; a context that gives the port back.
+    """Server of a page of scans on a local port; as a context manager it releases the port.
 
     Args:
         scans: files and folders; None: the sample that comes with the package.
@@ -66,7 +66,7 @@ class ScanServer:
         options: which model runs, and how.
         reading: how the files are read and the sensor was mounted.
         score: show detections from this score on, or by class; None: the thresholds of the model.
-        around: look in every direction.
+        around: detect in every direction, see `asca_deploy.around`.
 
     Attributes:
         address: where the page is.
@@ -102,7 +102,7 @@ class ScanServer:
         self.names = [scan.name.as_posix() + scan.path.suffix for scan in named]
         self.said = tuple(scan_input.said)
         answers = _Answers(paths, scan_input, detector, around=around)
-        answers.boxes(0)  # what is wrong with all scans is said before the page opens
+        answers.boxes(0)  # errors that concern all scans are raised before the page opens
         files = {f"/{file.name}": file.read_bytes() for file in page_modules()}
         files["/"] = files["/index.html"]
         page = {
@@ -153,7 +153,7 @@ class _Server(ThreadingHTTPServer):
 
 
 class _Answers:
-    """Points and boxes of scans by their number; one request at a time, because the detector is one."""
+    """Points and boxes of scans by their number; requests are handled one at a time."""
 
     def __init__(self, paths: Sequence[Path], scan_input: ScanInput, detector: Detector, *, around: bool) -> None:
         self._paths, self._detector = paths, detector
@@ -163,7 +163,7 @@ class _Answers:
         self._read: Callable[[int], Scan] = lru_cache(maxsize=1)(lambda number: scan_input.read(paths[number]))
 
     def points(self, number: int) -> bytes:
-        """The points of a scan in a level frame, little-endian float32 x, y, z, reflectance."""
+        """Return the points of a scan in a level frame, little-endian float32 x, y, z, reflectance."""
         with self._lock:
             points = self._read(number).points
         if self._level is not None:
@@ -171,7 +171,7 @@ class _Answers:
         return np.ascontiguousarray(points, "<f4").tobytes()
 
     def boxes(self, number: int) -> bytes:
-        """Content of the page for a scan; `save` is what `asca detect` writes of it."""
+        """Return the page's content for a scan; `save` is what `asca detect` writes of it."""
         with self._lock:
             scan = self._read(number)
             found = self._detector(scan.points)
@@ -186,7 +186,7 @@ class _Answers:
 
 
 def _level_boxes(found: ScanDetections) -> list[dict[str, Any]]:
-    """Class, score and box (7 numbers) of each detection, x forward, y left, z up; the same order as in the scan."""
+    """Return class, score and box (7 numbers) of each detection, x forward, y left, z up, in the scan's order."""
     boxes = found.boxes if found.level is None else found.level.boxes(found.boxes)
     return [
         {"class": name, "score": float(score), "box": [float(value) for value in box]}

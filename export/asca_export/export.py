@@ -1,4 +1,4 @@
-"""A checkpoint becomes a bundle, or a clear refusal."""
+"""Export of a checkpoint to a bundle."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -19,7 +19,7 @@ EXPORTERS: dict[str, Callable[[Checkpoint, Any, Any, ExportOptions], Bundle]] = 
     "pillar_refine": export_refine_bundle,
     "pv_rcnn": export_pv_rcnn_bundle,
 }
-"""By `model.kind`."""
+"""Exporters by `model.kind`."""
 
 
 def export_bundle(

@@ -1,4 +1,4 @@
-"""A checkpoint, or a bundle that holds its weights, becomes a bundle: what `asca export` does."""
+"""Export of a checkpoint, or of a bundle that holds its weights: `asca export`."""
 
 import json
 from collections.abc import Callable
@@ -31,16 +31,17 @@ View = Literal["camera", "full"]
 
 
 class Source(NamedTuple):
-    """What is exported, and what it says of itself."""
+    """A checkpoint to export, and its origin."""
 
     path: Path
-    """Of the checkpoint."""
+    """Path of the checkpoint."""
     checkpoint: "Checkpoint"
     score_thresholds: dict[str, float]
-    """Of the bundle that holds the checkpoint, class by class; empty of others: those of its config are meant."""
+    """Thresholds by class of the bundle that holds the checkpoint; empty for other checkpoints, whose config has
+    them."""
     trained_on: str
     command: str
-    """That trained it."""
+    """The command that trained it."""
 
 
 def export(
@@ -64,18 +65,18 @@ def export(
         checkpoint: of a run, or a bundle (folder, or name of one that ships) that holds its weights.
         out: folder of the bundle; an earlier bundle there is replaced.
         scans: like those trained on, to compare on; None: simulated ones.
-        trained_on: what the weights saw, for the manifest; None: what a bundle says of itself.
+        trained_on: training data in words, for the manifest; None: from the bundle that holds the weights.
         score: thresholds of the bundle; None: those of the checkpoint.
-        range_m: where the bundle looks for objects, x0 x1 y0 y1 in metres; None: as trained.
+        range_m: detection range of the bundle, x0 x1 y0 y1 in metres; None: as trained.
         int8: make the graphs 8-bit ones.
         calibrate: scans to calibrate these with; None: simulated ones.
         dense_neck: write a sparse neck as dense convolutions with masks.
         with_weights: add the weights, in 16 bits.
         progress: called while scans are simulated.
-        step: told what is being done.
+        step: called with a description of each step.
 
     Returns:
-        The manifest; `parity` and `quantization` say how far it is from the checkpoint.
+        The manifest; `parity` and `quantization` are the differences from the checkpoint.
 
     Raises:
         AscaError: an argument cannot be used, `out` holds something else, or the graphs differ from PyTorch.
@@ -124,7 +125,7 @@ def export(
 
 
 def open_source(source: Path) -> Source:
-    """A checkpoint, or a bundle (folder, or name of one that ships) that holds its own.
+    """Open a checkpoint, or a bundle (folder, or name of one that ships) that holds its own.
 
     Raises:
         AscaError: it is missing, damaged or a bundle without weights.
@@ -144,7 +145,7 @@ def open_source(source: Path) -> Source:
 
 
 def with_ranges(spec: DetectorSpec, range_m: tuple[float, float, float, float]) -> PillarSpec:
-    """The same detector that looks for objects elsewhere: from x0 to x1 and from y0 to y1, metres, LiDAR frame.
+    """Return the same detector with other ranges: from x0 to x1 and from y0 to y1, metres, LiDAR frame.
 
     Raises:
         ConfigError: it is no detector on pillars, or pillars do not fill these ranges; the nearest that fit are named.
@@ -158,7 +159,7 @@ def with_ranges(spec: DetectorSpec, range_m: tuple[float, float, float, float]) 
 def read_or_simulate(
     folder: str | Path | None, reporter: Reporter, most: int, seed: int, view: View = "full"
 ) -> list[NDArray[np.float32]]:
-    """Scans of a folder, evenly spaced if there are more than `most`; without a folder simulated ones.
+    """Return scans of a folder, evenly spaced if there are more than `most`; without a folder, simulated ones.
 
     Each is (N, 4): x, y, z in metres, LiDAR frame, and reflectance.
     """
@@ -174,7 +175,7 @@ def read_or_simulate(
 
 
 def run_environment(checkpoint: Path) -> dict[str, Any]:
-    """What the run wrote of itself, if the checkpoint still lies in its run's folder.
+    """Return the environment that the run recorded, if the checkpoint is still in its run's folder; otherwise {}.
 
     Raises:
         TrainingError: the file there is damaged.

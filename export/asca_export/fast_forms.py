@@ -1,4 +1,4 @@
-"""The trained network in the forms that run fastest; the export proves them to be the same function.
+"""Equivalent forms of the trained network that run fastest; the export proves the equivalence.
 
 - A batch normalization after a convolution is part of its weights.
 - A transposed convolution whose kernel equals its stride writes every output once: it is a 1x1 convolution to stride^2
@@ -22,13 +22,13 @@ from torch.nn.utils.fusion import fuse_conv_bn_eval, fuse_linear_bn_eval
 from asca_pillars.models.map_backbone import SSDHead
 from asca_pillars.models.pillar.encoder import PillarEncoder, pillar_max
 
-# What one step of an 8-bit tensor counts for in the graph: any number would do but one, which OpenVINO leaves out and
+# Value of one step of an 8-bit tensor in the graph: any number would do but one, which OpenVINO leaves out and
 # then takes the tensor for a float.
 STEP_VALUE = 1 / 64
 
 
 class CanvasSteps(NamedTuple):
-    """A pseudo-image's real value is scale * (step - empty), channel by channel."""
+    """Quantization of a pseudo-image: its real value is scale * (step - empty), by channel."""
 
     scale: Tensor
     """(C,) positive."""
@@ -41,7 +41,7 @@ class NeckAndHead(Protocol):
 
     @property
     def neck(self) -> Any:
-        """With `blocks` and `deblocks`."""
+        """The neck, with `blocks` and `deblocks`."""
 
     @property
     def head(self) -> Any:
@@ -57,7 +57,7 @@ class Stage(NamedTuple):
 
 
 def fast_encoder(encode: PillarEncoder) -> nn.Module:
-    """The encoder, in evaluation mode, in the form of `FastEncoder` where it has that form, otherwise as it is.
+    """Return the encoder, in evaluation mode, as a `FastEncoder` where it has that form, otherwise unchanged.
 
     Attention over points, or a pillar's empty slots, need each point's feature, not the largest alone.
     """
@@ -84,7 +84,7 @@ class FastBackbone(nn.Module):
     """Neck and head of a trained detector as one graph in fast forms.
 
     Args:
-        detector: in evaluation mode; it stays as it is.
+        detector: in evaluation mode; not modified.
         steps: of the pseudo-image, which then holds STEP_VALUE times the step; None for real values.
         padded: whether the pseudo-image comes with the first convolution's padding.
         attention: a module after each block, if there is any.
@@ -112,7 +112,7 @@ class FastBackbone(nn.Module):
             _take_steps(first, steps, padded=padded)
 
     def stages(self) -> list[Stage]:
-        """The blocks, from the finest map to the coarsest."""
+        """Return the blocks, from the finest map to the coarsest."""
         stages = []
         for i, (block, upsample) in enumerate(zip(self.blocks, self.upsamples, strict=True)):
             assert isinstance(block, nn.Sequential) and isinstance(upsample, Upsample)
@@ -121,7 +121,7 @@ class FastBackbone(nn.Module):
         return stages
 
     def forward(self, canvas: Tensor) -> tuple[Tensor, ...]:
-        """(1, ny + 1, nx + 1, C) -> scores (1, H, W, A), boxes (1, H, W, 7A), directions (1, H, W, 2A).
+        """Run: (1, ny + 1, nx + 1, C) -> scores (1, H, W, A), boxes (1, H, W, 7A), directions (1, H, W, 2A).
 
         Without padding in it the pseudo-image is (1, ny, nx, C).
         """
@@ -152,7 +152,7 @@ class Upsample(nn.Module):
             self.convolution.bias.copy_(fused.bias.repeat(self.stride**2))
 
     def forward(self, features: Tensor) -> Tensor:
-        """Unitless (1, C, H, W) -> (1, stride * H, stride * W, channels)."""
+        """Upsample unitless (1, C, H, W) -> (1, stride * H, stride * W, channels)."""
         upsampled = torch.relu(self.convolution(features)).permute(0, 2, 3, 1)
         if self.stride == 1:
             return upsampled
@@ -179,7 +179,7 @@ class _Head(nn.Module):
 
 
 def _folded(block: nn.Module) -> nn.Sequential:
-    """Convolution, normalization, ReLU, ... -> convolution, ReLU, ..."""
+    """Fold normalizations into convolutions: convolution, ReLU, ..."""
     children, layers = list(block.children()), []
     for convolution, norm in zip(children[0::3], children[1::3], strict=True):
         assert isinstance(convolution, nn.Conv2d) and isinstance(norm, nn.BatchNorm2d)

@@ -1,4 +1,4 @@
-"""PyTorch modules -> the two ONNX graphs of a bundle. The scatter between them is not exported: it is an assignment."""
+"""Export of PyTorch modules to the two ONNX graphs of a bundle; the scatter between them is not exported."""
 
 import dataclasses
 import json
@@ -28,7 +28,7 @@ from asca_pillars.ops.pillar.prepare import FEATURES
 B = TypeVar("B", bound=Bundle)
 
 OPSET = 20
-_EXAMPLE_ROWS = 6  # that the tracer sees; none is kept
+_EXAMPLE_ROWS = 6  # rows of the traced example; dynamic in the graph
 LOWEST = -3.0e38  # below any feature; every pillar holds a point, so it never survives the max
 
 
@@ -38,7 +38,7 @@ def export_encoder(encode: nn.Module, path: Path) -> None:
     `encode` is a `PillarEncoder`, or has its interface. M and P are dynamic. The `paper` reading takes P up to
     the limit that it was trained with.
     """
-    points, pillars = 4 * TRACED_PILLARS, TRACED_PILLARS  # of the example that the tracer sees; neither is kept
+    points, pillars = 4 * TRACED_PILLARS, TRACED_PILLARS  # sizes of the traced example; dynamic in the graph
     point_counts = torch.full((pillars,), points // pillars)
     example = (
         torch.rand(points, len(FEATURES)),
@@ -103,7 +103,7 @@ def export_backbone(backbone: FastBackbone | MaskedBackbone, map_shape: tuple[in
 
 
 def multiply_accumulates(path: Path) -> int:
-    """What the convolutions and matrix products of a graph with fixed shapes cost."""
+    """Return the multiply-accumulates of the convolutions and matrix products of a graph with fixed shapes."""
     graph = onnx.shape_inference.infer_shapes(onnx.load(path)).graph
     shapes = {
         value.name: [size.dim_value for size in value.type.tensor_type.shape.dim]
@@ -122,7 +122,7 @@ def multiply_accumulates(path: Path) -> int:
 
 
 def graph_path(folder: Path, name: str) -> Path:
-    """Where the graph of that name lies in a bundle's folder."""
+    """Return the path of a graph in a bundle's folder."""
     return folder / f"{name}.onnx"
 
 
@@ -140,7 +140,7 @@ def sign(folder: Path, bundle: B) -> B:
 def export_graph(module: nn.Module, example: Sequence[Tensor], path: Path, **names: Any) -> None:
     """Write a module as an ONNX file; `names` are those of `torch.onnx.export`."""
     with errors_only("torch.onnx"), errors_only("onnxscript"), warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of torch about torch
+        warnings.simplefilter("ignore")  # torch's warnings about its own code
         program = torch.onnx.export(
             module.eval(),
             tuple(example),
@@ -159,7 +159,7 @@ def export_graph(module: nn.Module, example: Sequence[Tensor], path: Path, **nam
 
 @contextmanager
 def errors_only(name: str) -> Iterator[None]:
-    """Without what a library's logger reports of every operator that it leaves as it is."""
+    """Log only errors of a library within the block; it would report every operator that it leaves unchanged."""
     logger = logging.getLogger(name)
     level = logger.level
     logger.setLevel(logging.ERROR)
@@ -182,13 +182,13 @@ class _Encoder(nn.Module):
 
 
 def _scatter_max(features: Any, pillar_index: Any, point_counts: Any) -> Any:
-    """`models.pillar.encoder.pillar_max` in ONNX: ScatterND with a max is the fast one of the forms that exist."""
+    """Translate `models.pillar.encoder.pillar_max` to ONNX: ScatterND with a max is the fastest form."""
     shape = op.Concat(op.Shape(point_counts), op.Shape(features, start=1), axis=0)
     lowest = op.Expand(op.Constant(value_float=LOWEST), shape)
     return op.ScatterND(lowest, op.Unsqueeze(pillar_index, op.Constant(value_ints=[1])), features, reduction="max")
 
 
 def _forget_origin(graph: Any) -> None:
-    """Drop the stack traces that the exporter writes at every node: they name folders of the exporting machine."""
+    """Drop the stack traces that the exporter writes at every node, which name folders of the machine."""
     for part in (graph, *graph.node, *graph.value_info, *graph.input, *graph.output, *graph.initializer):
         del part.metadata_props[:]

@@ -1,4 +1,4 @@
-"""A proven float bundle becomes an 8-bit one that says how far it is from it."""
+"""Quantization of a proven float bundle to 8 bits, with the differences measured."""
 
 import hashlib
 import tempfile
@@ -26,7 +26,7 @@ from asca_pillars.ops.pillar.spec import PillarSpec
 from asca_pillars.ops.pv_rcnn.spec import VoxelSpec
 
 MIN_CALIBRATION = 8
-# Of the class logits of the best anchors. With the bundle that ships 0.04 costs 0.2 points of AP and 0.10 costs two;
+# Error of the class logits of the best anchors. With the shipped bundle 0.04 costs 0.2 points of AP and 0.10 two;
 # layers return to floating point, the most harmful first, until the error is below.
 MAX_LOGIT_ERROR = 0.08
 SAME_IOU = 0.5
@@ -36,16 +36,16 @@ B = TypeVar("B", bound=Bundle)
 
 
 class Sensitivity(NamedTuple):
-    """What came out of the sweep over the layers; errors are those of `logit_error`."""
+    """Result of the sensitivity sweep over the layers; errors are those of `logit_error`."""
 
     alone: dict[str, float]
-    """With all layers in 8 bits but this one."""
+    """Error with all layers in 8 bits but this one."""
     kept_float: list[str]
     total: float
-    """Without those that are kept in floating point."""
+    """Error with all layers in 8 bits but `kept_float`."""
 
     def report(self, own: "CalibrationScans", compared: int) -> Quantization:
-        """For the manifest, boxes not counted yet."""
+        """Return the entry of the manifest; boxes are not counted yet."""
         return Quantization(
             calibration_scans=len(own.used),
             dropped_scans=own.dropped,
@@ -59,19 +59,19 @@ class Sensitivity(NamedTuple):
 
 
 class CalibrationScans(NamedTuple):
-    """What can be calibrated on."""
+    """Scans for calibration."""
 
     used: list[Points]
     dropped: int
-    """Those that parity is proven on."""
+    """Number of scans left out because parity is proven on them."""
 
 
 def calibration_scans(
     calibration: Sequence[Points], scans: Sequence[Points], spec: PillarSpec | VoxelSpec
 ) -> CalibrationScans:
-    """Those of `calibration`, scans (N, 4) in the LiDAR frame, that have points on the grid and are not among `scans`.
+    """Return the scans (N, 4) of `calibration`, LiDAR frame, that have points on the grid and are not among `scans`.
 
-    With one of `scans` the comparison would be with what the ranges were fitted to.
+    A comparison on a calibration scan would be on data that the ranges were fitted to.
 
     Raises:
         ExportError: fewer than MIN_CALIBRATION.
@@ -104,7 +104,7 @@ def quantize_bundle(
         detector: what it was exported from, in evaluation mode.
         calibration: scans (N, 4), LiDAR frame, that set the ranges, see `calibration_scans`.
         scans: to measure on.
-        progress: told what is being done.
+        progress: called with a description of each step.
 
     Raises:
         ExportError: too few scans, or MAX_LOGIT_ERROR is exceeded whatever stays in floating point.
@@ -168,7 +168,7 @@ def sweep(
     Args:
         layers: by name.
         error_of: the `logit_error` with these layers in 8 bits.
-        progress: told what is being done.
+        progress: called with a description of each step.
 
     Raises:
         ExportError: MAX_LOGIT_ERROR is exceeded whatever stays in floating point.
@@ -192,7 +192,7 @@ def sweep(
 
 
 def _with_boxes(report: Quantization, expected: Sequence[Detections], found: Sequence[Detections]) -> Quantization:
-    """The report with the boxes that the 8-bit bundle finds again, and those that it alone finds."""
+    """Return the report with the boxes that the 8-bit bundle finds again, and those that it alone finds."""
     matched = sum(map(_partnered, expected, found))
     added = sum(map(len, found)) - sum(map(_partnered, found, expected))
     return replace(report, boxes_matched=matched, boxes_added=added)
@@ -210,7 +210,7 @@ def _encode(pipeline: PillarPipeline, points: Points) -> Encoded:
 def logit_error(
     expected: Sequence[NDArray[np.float32]], found: Iterator[NDArray[np.float32]], spec: PillarSpec | VoxelSpec
 ) -> float:
-    """RMS difference of the class logits, at the COMPARED_ANCHORS best anchors of each class and scan."""
+    """Return the RMS difference of the class logits, at the COMPARED_ANCHORS best anchors of each class and scan."""
     squares = []
     for want, got in zip(expected, found, strict=True):
         for ours, theirs in zip(by_class(want, spec), by_class(got, spec), strict=True):
@@ -221,6 +221,6 @@ def logit_error(
 
 
 def _partnered(boxes: Detections, others: Detections) -> int:
-    """How many of the boxes the others have too."""
+    """Return the number of boxes that match one of the others."""
     same = boxes.labels[:, None] == others.labels[None]
     return int(((bev_iou(boxes.boxes, others.boxes) >= SAME_IOU) & same).any(axis=1).sum())

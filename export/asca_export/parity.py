@@ -1,4 +1,4 @@
-"""The proof that a bundle is the trained model: PyTorch and onnxruntime on the same scans, stage by stage."""
+"""Parity of a bundle and the trained model: PyTorch and onnxruntime on the same scans, stage by stage."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -27,7 +27,7 @@ from asca_pillars.ops.two_stage.decode import Scores, reported_detections
 MAP_TOLERANCE = 1e-3  # largest absolute difference of a head map; of pillar features, see `prove_parity`
 BOX_TOLERANCE_M = 0.01
 YAW_TOLERANCE_RAD = np.deg2rad(0.5)
-OVERLAP_TIE = 1e-4  # of an overlap with the largest that suppression allows
+OVERLAP_TIE = 1e-4  # tolerance of an overlap at the NMS threshold
 COMPARED_ANCHORS = 100  # per class and scan: the best ones, whatever their score, so that there is always something
 
 
@@ -80,30 +80,30 @@ def prove_parity(detector: PillarDetector, runtime: PillarPipeline, scans: Seque
 
 
 def require_compared(scans: int) -> int:
-    """The number of scans that a proof rests on, which must not be none."""
+    """Return the number of compared scans; ExportError if there are none."""
     if not scans:
         raise ExportError("none of the scans given to prove parity on has a point in the model's ranges; give others")
     return scans
 
 
 def _maps(detector: PillarDetector, batch: PillarBatch) -> Maps:
-    """What PyTorch says of a batch of one frame: maps, or rows of its active head cells."""
+    """Return PyTorch's outputs for a batch of one frame: maps, or rows of its active head cells."""
     maps = (part.numpy() for part in detector(batch))
     return HeadMaps(*(part if batch.neck is not None else part[0] for part in maps))
 
 
 def _at_cells(maps: Maps, cells: NDArray[np.int32], scan: int) -> tuple[Maps, NDArray[np.int32]]:
-    """Rows of maps (channels, H, W) at the active head cells, (M,); no other cell may have a score."""
+    """Return rows of maps (channels, H, W) at the active head cells, (M,); no other cell may have a score."""
     elsewhere = np.delete(maps.scores.reshape(len(maps.scores), -1), cells, axis=1)
     require_close("head `scores` of inactive cells", np.full_like(elsewhere, NEVER), elsewhere, 0, scan)
     return HeadMaps(*(part.reshape(len(part), -1).T[cells] for part in maps)), cells
 
 
 def by_class(scores: NDArray[np.float32], spec: PillarSpec | VoxelSpec) -> NDArray[np.float32]:
-    """The logits (A, H, W), or rows (M, A), of each class: (classes, n); likewise of A * classes."""
+    """Return the logits (A, H, W), or rows (M, A), of each class: (classes, n); likewise of A * classes."""
     classes = len(spec.classes)
     channels = scores if scores.ndim == 3 else scores.T
-    if spec.scores_per_anchor > 1:  # of an anchor those of all classes, then the next anchor's
+    if spec.scores_per_anchor > 1:  # anchor-major: scores of all classes for an anchor, then the next anchor
         channels = channels.reshape(-1, classes, channels.size // len(channels)).swapaxes(0, 1)
     return channels.reshape(classes, scores.size // classes)
 
@@ -111,7 +111,7 @@ def by_class(scores: NDArray[np.float32], spec: PillarSpec | VoxelSpec) -> NDArr
 def require_close(
     stage: str, expected: NDArray[np.float32], found: NDArray[np.float32], allowed: float, scan: int
 ) -> float:
-    """The largest difference, which must not exceed what is allowed."""
+    """Return the largest difference; ExportError if it exceeds `allowed`."""
     error = float(np.abs(expected - found).max(initial=0.0))
     if not error <= allowed:
         raise _unlike(
@@ -167,8 +167,7 @@ def compare_boxes(
     """Decode both maps and pair the boxes, before and after suppression; every box needs a partner.
 
     Thresholds are lowered until the best COMPARED_ANCHORS of each class take part, and all boxes are kept. Before
-    suppression nothing but the thresholds can excuse a difference; after it, which of two overlapping boxes of equal
-    score survives can.
+    suppression only thresholds can explain a difference; after it, ties between overlapping boxes of equal score can.
 
     Args:
         expected, found: maps, or rows of the same head cells.
@@ -255,6 +254,6 @@ def _ties(lone: Detections, others: Detections, spec: PillarSpec) -> NDArray[np.
 
 
 def _beyond_allowed(a: Detections, b: Detections, spec: PillarSpec) -> NDArray[np.float64]:
-    """(N, M): overlap minus the largest that suppression keeps side by side; -inf for pairs of two classes."""
+    """Return (N, M): overlap minus the largest that suppression allows; -inf for pairs of two classes."""
     same_class = a.labels[:, None] == b.labels[None]
     return np.where(same_class, bev_iou(a.boxes, b.boxes) - spec.post.nms_iou, -np.inf)

@@ -43,7 +43,7 @@ class ExportOptions:
             that parity is proven on are left out and counted. None exports in float32.
         dense_neck: write a sparse neck as dense convolutions with masks, in float32 alone, see `pillar.masked_forms`.
         weights: the checkpoint's file, whose weights are to lie beside the graphs in 16 bits; None leaves them out.
-        progress: told what is being done.
+        progress: called with a description of each step.
     """
 
     trained_on: str = "not stated"
@@ -75,7 +75,7 @@ def draft_bundle(
     options: ExportOptions,
     **sections: Any,
 ) -> B:
-    """The manifest of a checkpoint in float32, without graphs and proof.
+    """Return the manifest of a checkpoint in float32, without graphs and parity.
 
     Args:
         bundle_type: of its family.

@@ -1,8 +1,7 @@
-"""The backbone in 8 bits: every activation in steps of its own channel, every weight rounded with the others in view.
+"""Quantization of the backbone to 8 bits: per-channel steps of activations, jointly rounded weights.
 
-Most of a pseudo-image is empty, and there a trained network gives the same small values everywhere. If those are
-rounded, one and the same error stands all over the map and grows from layer to layer; nothing else costs as much
-precision. So
+Most of a pseudo-image is empty, where a trained network has the same small values everywhere. Rounding them makes the
+same error all over the map, which grows from layer to layer and costs more precision than anything else. Therefore:
 
 - a channel's step is its largest value on the calibration scans / 255, then stretched until its value in empty space is
   a whole number of steps. Steps of single channels are free: between a ReLU and the next layer a positive factor moves
@@ -11,7 +10,7 @@ precision. So
   scans (GPTQ, arXiv 2210.17323); the bias makes up for what remains in empty space.
 
 Weights are signed 7-bit per output channel. Seven, because CPUs without VNNI add pairs of products u8 x s8 in 16 bits:
-2 x 255 x 64 fits, 2 x 255 x 127 does not, and they would saturate without a word.
+2 x 255 x 64 fits, 2 x 255 x 127 does not, and they would saturate silently.
 """
 
 from collections.abc import Collection, Iterable, Iterator
@@ -29,14 +28,14 @@ HEAD = "head"
 STEPS = 255
 WEIGHT_STEPS = 64
 EMPTY_SIZE = 256  # cells to a side; the deepest convolution of the paper's neck sees 99 of them
-PLACES = 8000  # of each scan and layer, whose inputs weights are rounded for
-_DAMPING = 0.001  # of the moments' mean diagonal, so that inputs that hardly ever move do not blow up
+PLACES = 8000  # samples of each scan and layer for rounding weights
+_DAMPING = 0.001  # of the moments' mean diagonal, for inputs of little variance
 _SHRINK = 0.95  # a range may lose this much of its end where that spares it coarser steps
 TINY = 1e-6  # a channel that is never above it is as good as empty; its step must not be 0
 
 
 def canvas_steps(pillar_features: Iterable[NDArray[np.float32]]) -> CanvasSteps:
-    """Steps of a canvas that holds the unitless features of all these scans, (P, C) each, and zero exactly."""
+    """Return the steps of a canvas for the unitless features of all these scans, (P, C) each, and exactly zero."""
     lows, highs = zip(*((features.min(axis=0), features.max(axis=0)) for features in pillar_features), strict=True)
     low, high = np.minimum(np.min(lows, axis=0), 0.0), np.maximum(np.max(highs, axis=0), 0.0)
     scale = np.maximum((high - low) / STEPS, TINY).astype(np.float32)
@@ -45,7 +44,7 @@ def canvas_steps(pillar_features: Iterable[NDArray[np.float32]]) -> CanvasSteps:
 
 
 def layer_names(backbone: FastBackbone) -> list[str]:
-    """The layers that can compute in 8 bits, by the names of their modules."""
+    """Return the layers that can compute in 8 bits, by the names of their modules."""
     return [name for name, layer in backbone.named_modules() if isinstance(layer, nn.Conv2d)] + [HEAD]
 
 
@@ -85,7 +84,7 @@ def scale_to_steps(backbone: FastBackbone, canvases: Iterable[NDArray[np.uint8]]
 
 
 class Moments(NamedTuple):
-    """What the layers of a backbone read."""
+    """Moments of the inputs of a backbone's layers."""
 
     empty: dict[str, Tensor]
     """(inputs,) in empty space, by layer."""
@@ -95,7 +94,7 @@ class Moments(NamedTuple):
 
 @torch.no_grad()
 def input_moments(backbone: FastBackbone, canvases: Iterable[NDArray[np.uint8]], steps: CanvasSteps) -> Moments:
-    """Moments of what every layer reads on the calibration scans.
+    """Return moments of what every layer reads on the calibration scans.
 
     Args:
         backbone: scaled to steps.
@@ -137,7 +136,7 @@ def round_weights(backbone: FastBackbone, layers: Collection[str], moments: Mome
 
 
 def round_together(weight: Tensor, squares: Tensor) -> Tensor:
-    """Unitless weights (outputs, n) on a grid of 2 WEIGHT_STEPS + 1 values per output; the outputs change little.
+    """Round unitless weights (outputs, n) jointly to a grid of 2 WEIGHT_STEPS + 1 values per output.
 
     The largest weight of an output stays at the end of its grid, from which the graph's writer takes the grid's unit.
     """
@@ -156,7 +155,7 @@ def round_together(weight: Tensor, squares: Tensor) -> Tensor:
 
 
 class _Pass(NamedTuple):
-    """One layer at work on one scan."""
+    """Inputs and outputs of one layer for one scan."""
 
     input: Tensor
     """(1, inputs, H, W)"""
@@ -186,7 +185,7 @@ def _empty_canvas(backbone: FastBackbone, steps: CanvasSteps) -> Tensor:
 
 
 def _center(values: Tensor) -> Tensor:
-    """(C,) of (1, C, H, W), far from any border; of upsampled maps the mean over the places of one cell."""
+    """Return (C,) of (1, C, H, W), far from any border; of upsampled maps the mean over the places of one cell."""
     _, _, height, width = values.shape
     return values[0, :, height // 2 :, width // 2 :][:, :4, :4].mean(dim=(1, 2))
 

@@ -1,9 +1,9 @@
-"""A bundle written again for this version, its networks as they are.
+"""Reissue of a bundle for this version, with unchanged networks.
 
     python -m asca_export.reissue asca_small_sim --scans data/sim/training/velodyne -o bundles/asca_small_sim
 
-Bundles of an older schema are read as they are; this is for those that are handed on: their graphs get today's stamp,
-and `expected_input` is measured on scans that are like those trained on.
+Bundles of an older schema can be read without it. Use it before publishing one: the graphs get the current stamp, and
+`expected_input` is measured on scans like those of the training.
 """
 
 import shutil

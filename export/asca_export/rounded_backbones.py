@@ -42,7 +42,7 @@ class Encoded(NamedTuple):
     pillars: Pillars
 
     def in_steps(self, steps: CanvasSteps) -> NDArray[np.uint8]:
-        """(P, C) unitless whole steps of the features."""
+        """Return the features in whole steps, (P, C), unitless."""
         scale, empty = steps.scale.numpy(), steps.empty.numpy()
         return np.clip(np.round(self.features / scale + empty), 0, STEPS).astype(np.uint8)
 
@@ -64,7 +64,7 @@ def round_backbone(
     """Round the weights of a dense or of a sparse neck and its head.
 
     Args:
-        detector: in evaluation mode; it stays as it is.
+        detector: in evaluation mode; not modified.
         encoded: the calibration scans.
         steps: of their pillar features.
         work: folder for what is needed on the way.
@@ -116,7 +116,7 @@ class RoundedMaps:
         quantize_backbone(self._template, path, eight_bit, self._parameters(eight_bit))
 
     def _parameters(self, eight_bit: Sequence[str]) -> dict[str, Tensor]:
-        """Parameters by name: rounded ones of the layers in 8 bits, exact ones of the others."""
+        """Return the parameters by name: rounded ones of the layers in 8 bits, exact ones of the others."""
         own = dict(self._rounded.named_parameters())
         return {
             name: own[name] if name.rpartition(".")[0] in eight_bit else parameter
@@ -220,7 +220,7 @@ def _layer(node: onnx.NodeProto) -> str:
 
 
 def _feed_uint8(graph: onnx.GraphProto) -> None:
-    """Take the canvas as uint8. Runtimes know how to move the conversion through the transpose that follows."""
+    """Declare the canvas input as uint8. Runtimes can move the conversion through the transpose that follows."""
     (canvas,) = graph.input
     for node in graph.node:
         node.input[:] = ["float_canvas" if name == canvas.name else name for name in node.input]

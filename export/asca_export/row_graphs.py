@@ -22,7 +22,7 @@ _TINY = 1e-12
 
 
 class RowGraph:
-    """Nodes and constants as they come; what a method gives is the name of its result.
+    """Builder of a graph's nodes and constants; methods return the name of their result.
 
     Args:
         product: a layer's weights by its name, rounded already for those of `eight_bit`.
@@ -37,7 +37,7 @@ class RowGraph:
         self._outputs: list[onnx.ValueInfoProto] = []
 
     def take(self, name: str, kind: int, rows: str, width: int | None = None) -> str:
-        """An input (rows, width), or (rows,)."""
+        """Declare an input (rows, width), or (rows,)."""
         self._inputs[name] = helper.make_tensor_value_info(name, kind, [rows] if width is None else [rows, width])
         return name
 
@@ -46,18 +46,18 @@ class RowGraph:
         self._outputs.append(helper.make_tensor_value_info(name, kind, [rows, width]))
 
     def gather(self, owner: str, rows: str, missing: NDArray[Any], table: str, taps: int) -> str:
-        """Unitless rows by the table (M, taps), the row `missing` (C,) behind the last: (M, taps * C)."""
+        """Gather unitless rows by the table (M, taps), the row `missing` (C,) behind the last: (M, taps * C)."""
         self.take(table, TensorProto.INT32, f"{table}_rows", taps)
         padded = self.node("Concat", owner, "padded", rows, self.constant(owner, "missing", missing[None]), axis=0)
         gathered = self.node("Gather", owner, "gathered", padded, table, axis=0)
         return self.reshape(owner, "rows", gathered, taps * len(missing))
 
     def reshape(self, owner: str, what: str, rows: str, width: int, count: int = -1) -> str:
-        """(count, width)."""
+        """Reshape to (count, width)."""
         return self.node("Reshape", owner, what, rows, self.constant(owner, f"{what}_shape", np.array([count, width])))
 
     def product(self, name: str, rows: str, *, steps: bool) -> str:
-        """Gemm, of rows that are uint8 `steps` or floating point."""
+        """Add a Gemm on rows that are uint8 `steps` or floating point."""
         product = self._product(name)
         weight, bias = product.weight.numpy(), product.bias.numpy()
         if steps:
@@ -70,26 +70,26 @@ class RowGraph:
         return self.node("Gemm", name, "product", rows, matrix, offset)
 
     def relu(self, name: str, results: str, *, steps: bool) -> str:
-        """Of a product, as uint8 `steps` or in floating point."""
+        """Add the ReLU of a product, with results in uint8 `steps` or in floating point."""
         results = self.node("Relu", name, "relu", results)
         return self.node("QuantizeLinear", name, "steps", results, *self._step(name)) if steps else results
 
     def in_float(self, owner: str, what: str, steps: str) -> str:
-        """STEP_VALUE times uint8 steps."""
+        """Dequantize uint8 steps to STEP_VALUE times the step."""
         return self._dequantized(owner, what, steps, *self._step(owner))
 
     def node(self, kind: str, owner: str, what: str, *inputs: str, **attributes: int) -> str:
-        """One operator."""
+        """Add one operator."""
         name = f"{owner}.{what}"
         self._nodes.append(helper.make_node(kind, list(inputs), [name], name=name, **attributes))
         return name
 
     def named(self, kind: str, outputs: Sequence[str], *inputs: str, **attributes: int) -> None:
-        """One operator whose results have these names."""
+        """Add one operator with results of these names."""
         self._nodes.append(helper.make_node(kind, list(inputs), list(outputs), name=f"{outputs[0]}.last", **attributes))
 
     def constant(self, owner: str, what: str, value: NDArray[Any]) -> str:
-        """A unitless initializer (any shape)."""
+        """Add a unitless initializer (any shape)."""
         name = f"{owner}.{what}"
         self._constants[name] = value
         return name

@@ -30,7 +30,7 @@ class NeckProduct(NamedTuple):
     """A convolution by table, followed by a ReLU."""
 
     name: str
-    """Of its product in `SparseBackbone.products`."""
+    """Name of its product in `SparseBackbone.products`."""
     table: str
     """The input of the graph that it gathers by."""
 
@@ -43,14 +43,14 @@ class Level(NamedTuple):
     places: str
     """The input of the graph that picks the upsampling's rows."""
     stride: int
-    """Of the upsampling."""
+    """Stride of the upsampling."""
 
 
 class SparseBackbone(nn.Module):
     """Sparse neck and head of a trained detector as matrix products by name.
 
     Args:
-        detector: in evaluation mode, with a sparse neck; it stays as it is.
+        detector: in evaluation mode, with a sparse neck; not modified.
         steps: of the pillar features, which then hold STEP_VALUE times the step; None for real values.
     """
 
@@ -90,13 +90,13 @@ class SparseBackbone(nn.Module):
                 first.bias.sub_(first.weight @ (steps.empty * STEP_VALUE).repeat(SAME.taps))
 
     def product(self, name: str) -> nn.Linear:
-        """The product of this name: weight (outputs, taps * C) with the channels of a tap side by side."""
+        """Return the product of this name: weight (outputs, taps * C) with the channels of a tap side by side."""
         product = self.products[name]
         assert isinstance(product, nn.Linear)
         return product
 
     def passes(self, features: Tensor, tables: NeckRulebooks[Tensor]) -> Iterator[tuple[str, Tensor, Tensor]]:
-        """Name, what it reads and what it gives of each product in turn: unitless (P, C), or STEP_VALUE times steps."""
+        """Yield name, input and output of each product in turn: unitless (P, C), or STEP_VALUE times steps."""
         inputs, maps = rulebook_inputs(tables), []
         missing = self.empty * STEP_VALUE
         for level in self.levels:
@@ -115,21 +115,21 @@ class SparseBackbone(nn.Module):
         yield HEAD, joined, self.product(HEAD)(joined)
 
     def forward(self, features: Tensor, tables: NeckRulebooks[Tensor]) -> HeadMaps[Tensor]:
-        """Pillar features (P, C) -> scores (H, A), boxes (H, 7A), directions (H, 2A) at H head cells."""
+        """Run: pillar features (P, C) -> scores (H, A), boxes (H, 7A), directions (H, 2A) at H head cells."""
         for _, _, output in self.passes(features, tables):
             last = output
         return HeadMaps(*last.split(self.head_channels, dim=1))
 
 
 def scale_and_shift(norm: nn.BatchNorm1d) -> tuple[Tensor, Tensor]:
-    """What a normalization in evaluation mode multiplies with and adds, (C,) each."""
+    """Return the scale and shift of a normalization in evaluation mode, (C,) each."""
     assert norm.running_var is not None and norm.running_mean is not None
     scale = norm.weight / torch.sqrt(norm.running_var + norm.eps)
     return scale, norm.bias - norm.running_mean * scale
 
 
 def linear(weight: Tensor, bias: Tensor | None) -> nn.Linear:
-    """A product with this unitless weight (outputs, n) and bias (outputs,), which nothing trains."""
+    """Return a frozen product with this unitless weight (outputs, n) and bias (outputs,)."""
     assert bias is not None
     product = nn.Linear(weight.shape[1], weight.shape[0])
     with torch.no_grad():
@@ -176,7 +176,7 @@ def export_sparse_backbone(
 
 
 def sparse_multiply_accumulates(backbone: SparseBackbone, tables: NeckRulebooks[NDArray[np.int32]]) -> int:
-    """Count of multiply-accumulates of the products on the scan that these tables, indices (M, 9), are of."""
+    """Count the multiply-accumulates of the products on the scan of these tables, indices (M, 9)."""
     inputs, total = rulebook_inputs(tables), 0
     for level in backbone.levels:
         for layer in level.convolutions:
@@ -187,10 +187,10 @@ def sparse_multiply_accumulates(backbone: SparseBackbone, tables: NeckRulebooks[
 
 
 def _joined(graph: RowGraph, maps: Sequence[str], places: Sequence[str], missing: NDArray[np.generic]) -> str:
-    """Rows of several maps, picked by places (H,) of each, side by side: (H, maps * channels).
+    """Return rows of several maps, picked by places (H,) of each, side by side: (H, maps * channels).
 
-    By one gather from all maps, one after the other with the row `missing` (1, channels) behind each: with one from
-    each of them, what they give would have to be copied once more, row by row, to stand side by side.
+    Uses one gather from all maps, concatenated with the row `missing` (1, channels) behind each: the results of one
+    gather per map would have to be copied again to stand side by side.
     """
     rows, indices, first = [], [], ""
     for number, (values, place) in enumerate(zip(maps, places, strict=True)):

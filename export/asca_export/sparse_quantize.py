@@ -1,8 +1,8 @@
 """The sparse backbone in 8 bits, as `quantize` does it for the dense one; here no empty space has to be rounded.
 
 A channel's step is its largest value on the calibration scans / 255. Weights are rounded together (GPTQ), and the bias
-makes up for what rounding changes in the mean. The head's are rounded for the cells that boxes come from: what it says
-of the many others is hardly read.
+makes up for what rounding changes in the mean. The head's weights are rounded for the cells with the highest scores,
+which boxes are decoded from.
 """
 
 import copy
@@ -17,19 +17,19 @@ from asca_export.quantize import HEAD, PLACES, STEPS, TINY, round_together
 from asca_export.sparse_forms import SparseBackbone
 from asca_pillars.ops.pillar.neck_rulebooks import NeckRulebooks
 
-BEST_CELLS = 32  # of each scan and anchor, that the head is rounded for
-OTHER_CELLS = 64  # of each scan beside them, so that background stays background
+BEST_CELLS = 32  # highest-scoring cells of each scan and anchor for rounding the head
+OTHER_CELLS = 64  # other cells of each scan, so that background scores stay low
 
 
 class SparseSample(NamedTuple):
-    """What the backbone reads of one scan."""
+    """Inputs of the backbone for one scan."""
 
     features: Tensor
     """(P, C) pillar features."""
     tables: NeckRulebooks[Tensor]
 
     def in_steps(self, steps: CanvasSteps) -> "SparseSample":
-        """With STEP_VALUE times the whole steps of its features."""
+        """Return the sample with features rounded to whole steps, times STEP_VALUE."""
         whole = (self.features / steps.scale + steps.empty).round().clamp(0, STEPS)
         return self._replace(features=whole * STEP_VALUE)
 
@@ -40,17 +40,17 @@ class RowProducts(Protocol):
     products: nn.ModuleDict
 
     def product(self, name: str) -> nn.Linear:
-        """Of this name."""
+        """Return the product of this name."""
 
     def passes(self, *sample: Any) -> Iterator[tuple[str, Tensor, Tensor]]:
-        """Name, what it reads (M, n) and what it gives (M, outputs) of each product in turn, unitless."""
+        """Yield name, input (M, n) and output (M, outputs) of each product in turn, unitless."""
 
 
 Backbone = TypeVar("Backbone", bound=RowProducts)
 
 
 class InputMoments(NamedTuple):
-    """Of what a product reads: mean (n,), and mean product of the differences from it (n, n)."""
+    """Moments of a product's inputs: mean (n,), and mean product of the differences from it (n, n)."""
 
     mean: Tensor
     squares: Tensor
@@ -84,7 +84,7 @@ def scale_rows_to_steps(backbone: SparseBackbone, samples: Iterable[SparseSample
 
 
 def highest_outputs(backbone: RowProducts, samples: Iterable[tuple[Any, ...]]) -> dict[str, Tensor]:
-    """The largest value (C,) of each channel of what every product gives, by name; at least 0."""
+    """Return the largest value (C,) of each channel of what every product gives, by name; at least 0."""
     highest: dict[str, Tensor] = {}
     for sample in samples:
         for name, _, output in backbone.passes(*sample):
@@ -97,7 +97,7 @@ def highest_outputs(backbone: RowProducts, samples: Iterable[tuple[Any, ...]]) -
 def read_moments(
     backbone: RowProducts, samples: Sequence[tuple[Any, ...]], places: int = PLACES
 ) -> dict[str, InputMoments]:
-    """Moments of what every product reads on the calibration scans, at so many places of each at most.
+    """Return moments of what every product reads on the calibration scans, at so many places of each at most.
 
     A head's are those of the cells with its highest scores, and of a few others.
     """
@@ -131,7 +131,7 @@ def round_products(backbone: RowProducts, layers: Collection[str], moments: dict
 
 
 def mixed_products(exact: Backbone, rounded: Backbone, eight_bit: Iterable[str]) -> Backbone:
-    """A copy of `exact` with the rounded products of these names."""
+    """Return a copy of `exact` with the rounded products of these names."""
     mixed = copy.deepcopy(exact)
     for name in eight_bit:
         mixed.products[name] = rounded.products[name]

@@ -1,4 +1,4 @@
-"""A checkpoint of OpenPCDet's or mmdetection3d's PointPillars or PV-RCNN becomes one of ours."""
+"""Import of checkpoints of OpenPCDet's or mmdetection3d's PointPillars or PV-RCNN."""
 
 import re
 from collections.abc import Mapping
@@ -28,23 +28,23 @@ CONFIG_OF = {
     FIRST_LINEAR: "mmdetection3d_pointpillars_kitti",
     FUSION: "mmdetection3d_pv_rcnn_kitti",
 }
-"""The configuration of the published model, by a name that only its family of checkpoints has."""
+"""Configuration of the published model, by a key that only its family of checkpoints has."""
 
 _STATES: dict[str, Literal["OpenPCDet", "mmdetection3d"]] = {"model_state": "OpenPCDet", "state_dict": "mmdetection3d"}
 _NOT_LEGACY = re.compile(r"\blegacy['\"]?\s*[=:]\s*False\b")  # in a configuration as Python or as JSON writes it
 
 
 class ForeignWeights(NamedTuple):
-    """What OpenPCDet or mmdetection3d wrote."""
+    """Weights in a file of OpenPCDet or mmdetection3d."""
 
     path: Path
     state: dict[str, Tensor]
     """Arrays by name."""
     steps: int
-    """Optimizer steps behind them, as far as the file says."""
+    """Optimizer steps of the training, if the file has them."""
     library: Literal["OpenPCDet", "mmdetection3d"] = "OpenPCDet"
     classes: tuple[str, ...] = ()
-    """Names of the classes in their order, as far as the file says."""
+    """Names of the classes in their order, if the file has them."""
     legacy: bool = True
     """Flag of mmdetection3d's encoder, see `encoder_links`; true unless the configuration in the file denies it."""
 
@@ -80,7 +80,7 @@ def read_foreign(path: str | Path) -> ForeignWeights:
 
 
 def _described(weights: ForeignWeights, content: Mapping[str, Any]) -> ForeignWeights:
-    """The weights with what stands beside them in the file.
+    """Return the weights with the metadata of the file.
 
     Raises:
         TrainingError: mmdetection3d before 1.0 wrote them.
@@ -105,7 +105,7 @@ def _described(weights: ForeignWeights, content: Mapping[str, Any]) -> ForeignWe
 
 
 def published_config(weights: ForeignWeights) -> str:
-    """Name of the configuration that ships for this family of checkpoints.
+    """Return the name of the configuration that ships for this family of checkpoints.
 
     Raises:
         TrainingError: it is neither PointPillars nor PV-RCNN.
@@ -120,7 +120,7 @@ def published_config(weights: ForeignWeights) -> str:
 
 
 def write_imported(weights: ForeignWeights, config: Config, out: str | Path) -> int:
-    """Write the weights as a checkpoint of `asca train`; how many arrays of theirs were used.
+    """Write the weights as a checkpoint of `asca train`; return how many of the source's arrays were used.
 
     Args:
         weights: theirs.
@@ -169,7 +169,7 @@ def _links(weights: ForeignWeights, model: PillarModel | PvRcnnModel, wanted: Ma
 
 
 class _Omitted:
-    """Stands for an object whose class is not known here: it takes what a pickle gives it, and keeps none of it."""
+    """Placeholder for an object of an unknown class; it accepts and drops what a pickle assigns to it."""
 
     def __new__(cls, *_: Any, **__: Any) -> "_Omitted":
         return super().__new__(cls)
@@ -182,7 +182,7 @@ class _Omitted:
 
 
 def load_weights_alone(path: Path) -> dict[str, Any]:
-    """The dictionary that a file of `torch.save` holds, weights only: nothing in it is executed.
+    """Read the dictionary in a file of `torch.save`, weights only: nothing in it is executed.
 
     Training logs and settings beside the weights are often objects of NumPy or mmengine, which PyTorch refuses as it
     refuses code. Each name in the file that it does not know stands for `_Omitted`, so that the arrays can be read and

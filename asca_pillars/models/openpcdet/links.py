@@ -1,4 +1,4 @@
-"""Which of OpenPCDet's arrays becomes which of ours, and that none is left over on either side."""
+"""Mapping of OpenPCDet's arrays to ours; every array of either side must be matched."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import NamedTuple
@@ -10,21 +10,21 @@ from asca_pillars.base.errors import TrainingError
 _NORM_PARTS = ("weight", "bias", "running_mean", "running_var")
 _COUNTER = "num_batches_tracked"
 _WITHOUT_EFFECT = ("global_step",)  # OpenPCDet's counter of training steps lies beside the weights
-_NAMED = 5  # of the names that do not fit
+_NAMED = 5  # mismatched names in an error, at most
 
 
 def as_it_is(array: Tensor) -> Tensor:
-    """Unitless weights (out, in, ...) as they are, and arrays of any other shape."""
+    """Return unitless weights (out, in, ...), and arrays of any other shape, unchanged."""
     return array
 
 
 def without_singletons(array: Tensor) -> Tensor:
-    """A 1x1 convolution's unitless weight (out, in, 1, ...) as a linear layer's (out, in)."""
+    """Reshape a 1x1 convolution's unitless weight (out, in, 1, ...) to a linear layer's (out, in)."""
     return array.flatten(1) if array.shape[2:].numel() == 1 else array
 
 
 class Link(NamedTuple):
-    """One array: its name there, its name here, and how it is laid out anew."""
+    """Mapping of one array: source name, target name, conversion."""
 
     source: str
     target: str
@@ -32,14 +32,14 @@ class Link(NamedTuple):
 
 
 def norm_links(source: str, target: str) -> Iterator[Link]:
-    """Of a normalization."""
+    """Return the links of a normalization layer."""
     return (Link(f"{source}.{part}", f"{target}.{part}") for part in _NORM_PARTS)
 
 
 def convert_state(
     state: Mapping[str, Tensor], links: Iterable[Link], wanted: Mapping[str, Tensor], blamed: str
 ) -> dict[str, Tensor]:
-    """Our state dict from theirs; every array of theirs is used, or named in the error.
+    """Convert their state dict to ours; every array of theirs is used, or named in the error.
 
     Args:
         state: theirs by name: unitless weights (out, in, ...) and the (C,) values of normalizations.
@@ -86,7 +86,7 @@ _HEADS = {"scores": "conv_cls", "boxes": "conv_box", "directions": "conv_dir_cls
 
 
 def map_links(block_convs: Sequence[int], first: Callable[[Tensor], Tensor] = as_it_is) -> Iterator[Link]:
-    """Links of `backbone_2d` and `dense_head`.
+    """Yield the links of `backbone_2d` and `dense_head`.
 
     Args:
         block_convs: convolutions of each block after its first.
@@ -112,11 +112,11 @@ _LAYOUTS = (
     (0, 4, 1, 2, 3),  # outputs, kernel, inputs: 2.x
     (3, 4, 0, 1, 2),  # kernel, outputs, inputs: 2.x, weights of its native algorithm
 )
-"""Where each layout has the axes (out, in, z, y, x) of a dense convolution."""
+"""Position of the axes (out, in, z, y, x) of a dense convolution in each layout."""
 
 
 def dense_order(pairs: Sequence[tuple[Tensor, Tensor]]) -> Callable[[Tensor], Tensor]:
-    """The conversion of a network's unitless sparse weights to (out, in, z, y, x): the layout that fits all of them.
+    """Return the conversion of unitless sparse weights to (out, in, z, y, x), by the layout that fits all of them.
 
     Layers with as many inputs as outputs fit two of the layouts; all layers of a file have the same.
 

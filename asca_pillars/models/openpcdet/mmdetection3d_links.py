@@ -19,11 +19,11 @@ from asca_pillars.models.openpcdet.pv_rcnn_links import pv_rcnn_links
 _ENCODER, _VOXELS = "voxel_encoder.pfn_layers.0", "middle_encoder"
 FIRST_LINEAR = f"{_ENCODER}.linear.weight"
 FUSION = "points_encoder.point_feature_fusion_layer.0.conv.weight"
-_OLD_FEATURES = 9  # of a point before 1.0, where boxes had other axes, too
+_OLD_FEATURES = 9  # features of a point before 1.0, whose boxes had other axes too
 
 
 def _part(layer: str, layers: int) -> str:
-    """The name within a module of what stands `layer`-th where each module is counted as so many layers."""
+    """Return `conv` or `bn` for OpenPCDet's layer number, where each module counts `layers` layers."""
     return ("conv", "bn")[int(layer) % layers]
 
 
@@ -34,7 +34,7 @@ _POOLS = {
     "roi_head.roi_grid_pool_layer": "roi_head.bbox_roi_extractor.roi_grid_pool_layer",
 }
 _LAYERS = {"0": "0.conv", "1": "0.bn", "4": "2.conv", "5": "2.bn", "7": "3"}
-"""Of the fully connected layers: OpenPCDet has dropout at 3, mmdetection3d at 1."""
+"""Names of the fully connected layers: OpenPCDet has dropout at 3, mmdetection3d at 1."""
 _NAMES: tuple[tuple[str, _Name], ...] = (
     (r"backbone_2d\.blocks\.(\d+)\.(\d+)", lambda m: f"backbone.blocks.{m[1]}.{int(m[2]) - 1}"),  # without the padding
     (r"backbone_2d\.deblocks", lambda _: "neck.deblocks"),
@@ -52,13 +52,13 @@ _NAMES: tuple[tuple[str, _Name], ...] = (
     (r"roi_head\.(shared_fc|cls|reg)_layers?\.(\d)", lambda m: f"roi_head.bbox_head.{m[1]}_layer.{_LAYERS[m[2]]}"),
     (r"dense_head\.conv_box", lambda _: "dense_head.conv_reg"),
 )
-"""OpenPCDet's beginnings of names, and what stands there instead."""
+"""Prefixes of OpenPCDet's names, and their replacements."""
 
 
 def mmdetection3d_links(
     model: PillarModel | PvRcnnModel, state: Mapping[str, Tensor], wanted: Mapping[str, Tensor], *, legacy: bool = True
 ) -> Iterator[Link]:
-    """Links for our network of this model.
+    """Yield the links for our network of this model.
 
     Args:
         model: ours.
@@ -80,7 +80,7 @@ def mmdetection3d_links(
 
 
 def mmdetection3d_name(name: str, head: str = "rpn_head") -> str:
-    """mmdetection3d's name of an array of OpenPCDet's; `head` is that of its head on anchors."""
+    """Return mmdetection3d's name of an array of OpenPCDet's; `head` is that of its head on anchors."""
     for pattern, other in _NAMES:
         if match := re.match(pattern + r"(?=\.)", name):
             name = other(match) + name[match.end() :]

@@ -21,7 +21,7 @@ _X_CENTER, _Z_CENTER = FEATURES.index("x_center"), len(FEATURES)  # the last is 
 
 
 def pointpillars_links(model: PillarModel, state: Mapping[str, Tensor]) -> Iterator[Link]:
-    """Links for `build_pillar_detector(model)`; `state` has OpenPCDet's unitless weights (out, in, ...) by name.
+    """Yield the links for `build_pillar_detector(model)` from `state`, OpenPCDet's unitless weights (out, in, ...).
 
     Raises:
         TrainingError: points with other features.
@@ -33,7 +33,7 @@ def pointpillars_links(model: PillarModel, state: Mapping[str, Tensor]) -> Itera
 def encoder_links(
     model: PillarModel, state: Mapping[str, Tensor], layer: str, *, legacy: bool = False
 ) -> Iterator[Link]:
-    """Links of the layer on points.
+    """Yield the links of the layer on points.
 
     Args:
         model: ours.
@@ -54,7 +54,7 @@ def encoder_links(
         )
 
     def explicit(weight: Tensor) -> Tensor:
-        """Their weight (out, 10) of x, y, z themselves and of their offsets, each once."""
+        """Return their weight (out, 10) of x, y, z themselves and of their offsets, each once."""
         weight = weight.clone()
         if legacy:
             weight[:, _X_CENTER:] += weight[:, : _Z + 1]

@@ -19,7 +19,7 @@ _JOINED = ("points", *LEVEL_SOURCES)  # after the map
 
 
 def pv_rcnn_links(model: PvRcnnModel, state: Mapping[str, Tensor], wanted: Mapping[str, Tensor]) -> Iterator[Link]:
-    """Links for `build_pv_rcnn(model)` without what later papers add.
+    """Yield the links for `build_pv_rcnn(model)` without extensions by later papers.
 
     Args:
         model: ours.
@@ -94,13 +94,13 @@ def _level(model: PvRcnnModel, source: str) -> int:
 
 
 def _map_order(model: PvRcnnModel) -> Tensor:
-    """Of each channel of our map, which of theirs it is."""
+    """Return for each channel of our map the index of OpenPCDet's."""
     height, channels = model.spec.level_shapes[-1][0], model.network.voxel_channels[-1]
     return torch.arange(height * channels).view(channels, height).T.flatten()
 
 
 def _joined_order(model: PvRcnnModel) -> Tensor:
-    """Of each of our joined channels of a keypoint, which of theirs it is."""
+    """Return for each of our joined channels of a keypoint the index of OpenPCDet's."""
     of_map = _map_order(model)
     widths = {
         each.source: len(each.radii_m) * widths[-1]
@@ -115,7 +115,7 @@ def _joined_order(model: PvRcnnModel) -> Tensor:
 
 
 def _channels_of(order: Tensor) -> Callable[[Tensor], Tensor]:
-    """Input channels in another order, and no singleton axes behind them unless it is a convolution's kernel."""
+    """Reorder input channels, and drop singleton axes behind them unless it is a convolution's kernel."""
 
     def convert(weight: Tensor) -> Tensor:
         weight = without_singletons(weight)

@@ -1,8 +1,8 @@
 """Feature encoding network: points of pillars -> one feature vector per pillar (section 3.2 of the paper).
 
-Correlative point attention (CPA, eq. 6-11) is here in the readings that the paper's text allows. Letters: P pillars of
-one frame, M points, C channels, d attention width, N points of one pillar at most. Each reading ends with the residual
-connection of eq. (11), and so does the control without attention.
+Correlative point attention (CPA, eq. 6-11) is implemented in the variants that the paper's text allows. Letters: P
+pillars of one frame, M points, C channels, d attention width, N points of one pillar at most. Each variant ends with
+the residual connection of eq. (11), and so does the control without attention.
 """
 
 from abc import ABC, abstractmethod
@@ -44,7 +44,7 @@ class PaperAttention(nn.Module):
         self.restore = nn.Parameter(torch.empty(channels, max_pillars).uniform_(-bound, bound))
 
     def forward(self, features: Tensor) -> Tensor:
-        """Unitless features (P, C) -> (P, C) for the pillars of one frame, P <= max_pillars."""
+        """Apply the attention: unitless features (P, C) -> (P, C) for the pillars of one frame, P <= max_pillars."""
         pillars = features.shape[0]
         by_channel = features.T  # F of the paper, (C, P)
         query = by_channel @ self.query[:pillars] + self.bias["query"]  # (C, d)
@@ -62,10 +62,10 @@ class _ChannelMixing(nn.Module, ABC):
 
     @abstractmethod
     def mixing(self, features: Tensor) -> Tensor:
-        """(C, C) of the pillars (P, C) of one frame, unitless."""
+        """Return the mixing matrix (C, C) of the pillars (P, C) of one frame, unitless."""
 
     def forward(self, features: Tensor) -> Tensor:
-        """Unitless features (P, C) -> (P, C) for the pillars of one frame."""
+        """Apply the attention: unitless features (P, C) -> (P, C) for the pillars of one frame."""
         device = features.device.type
         if torch.is_autocast_enabled(device):  # differences of large sums: bfloat16 would leave little of them
             with torch.autocast(device, enabled=False):
@@ -76,10 +76,10 @@ class _ChannelMixing(nn.Module, ABC):
 
 
 class ChannelLinear(_ChannelMixing):
-    """No attention, but the layer that `ChannelAttention` would be if it were the same for every frame.
+    """Control without attention: a learned C x C mixing matrix that is the same for every frame.
 
-    It tells what of the attention's effect is that of one more linear layer. Training starts at the identity, near
-    which channel attention starts, too.
+    It separates the effect of attention from that of one more linear layer. Training starts at the identity, near the
+    start of channel attention.
     """
 
     def __init__(self, channels: int) -> None:
@@ -89,19 +89,19 @@ class ChannelLinear(_ChannelMixing):
         nn.init.zeros_(self.restore.bias)
 
     def mixing(self, features: Tensor) -> Tensor:
-        """(C, C), unitless, whatever the features (P, C)."""
+        """Return the mixing matrix (C, C), unitless, which does not depend on the features (P, C)."""
         return self.restore.weight
 
 
 class ChannelAttention(_ChannelMixing):
-    """The same C x C attention with projections per pillar, so that order and number of pillars do not matter.
+    """Channel attention (C x C) with projections per pillar, which depends on neither order nor number of pillars.
 
     Queries and keys are normalised along the pillars (cross-covariance attention, XCiT, arXiv 2106.09681), which
     keeps the logits' scale the same for a frame of ten pillars and one of ten thousand.
 
     Every product of queries and keys is one of pairs of channels summed over the pillars, so the channels' Gram matrix
-    holds all that the attention needs to know of the frame, and the projections act on it instead of on P pillars: two
-    products with the pillars where the textbook form has six.
+    suffices for the attention, and the projections act on it instead of on P pillars: two products with the pillars
+    where the textbook form has six.
     """
 
     def __init__(self, channels: int) -> None:
@@ -113,10 +113,10 @@ class ChannelAttention(_ChannelMixing):
         self.temperature = nn.Parameter(torch.ones(1))
 
     def mixing(self, features: Tensor) -> Tensor:
-        """(C, C) of the pillars (P, C) of one frame, unitless."""
+        """Return the mixing matrix (C, C) of the pillars (P, C) of one frame, unitless."""
         gram = features.T @ features  # (C, C)
         query, key = self.query.weight, self.key.weight
-        products = query @ gram @ key.T  # of queries and keys, summed over the pillars
+        products = query @ gram @ key.T  # products of queries and keys, summed over the pillars
         query_norm = _norm((query @ gram * query).sum(dim=1))
         key_norm = _norm((key @ gram * key).sum(dim=1))
         logits = products / (query_norm[:, None] * key_norm[None, :]) * self.temperature
@@ -141,7 +141,7 @@ class PointAttention(nn.Module):
         self.restore = nn.Linear(channels, channels)
 
     def forward(self, features: Tensor, pillar_index: Tensor, point_counts: Tensor) -> Tensor:
-        """(M, C) point features -> (M, C); points attend to the points of their own pillar only.
+        """Apply the attention: (M, C) point features -> (M, C); points attend to the points of their own pillar only.
 
         Args:
             features: (M, C), unitless, rows of one pillar adjacent.
@@ -175,10 +175,10 @@ def _(features: Tensor, pillar_index: Tensor, point_counts: Tensor) -> Tensor:
 
 
 def pillar_max(features: Tensor, pillar_index: Tensor, point_counts: Tensor) -> Tensor:
-    """Largest value of each channel among the points of each pillar: unitless features (M, C) -> (P, C).
+    """Return the channel-wise maximum over the points of each pillar: unitless features (M, C) -> (P, C).
 
-    Points lie flat, without padding, so nothing but real points can win. While a graph is exported the reduction is
-    one named operator, because the exporter knows no segment reduction (asca_export.graphs translates it).
+    Points lie flat, without padding, so only real points are compared. While a graph is exported the reduction is
+    one named operator, because the exporter has no segment reduction (asca_export.graphs translates it).
     """
     if torch.compiler.is_exporting():
         pooled: Tensor = _traced_pillar_max(features, pillar_index, point_counts)
@@ -203,7 +203,7 @@ class PillarEncoder(nn.Module):
         super().__init__()
         self.slots = limits.max_points if empty_slots else 0
         if empty_slots:
-            self.register_buffer("empty_slot", torch.zeros(channels))  # what a row of zeros gives
+            self.register_buffer("empty_slot", torch.zeros(channels))  # output for a row of zeros
         self.linear = nn.Linear(len(FEATURES), channels, bias=False)
         self.norm = nn.BatchNorm1d(channels, eps=NORM_EPS, momentum=NORM_MOMENTUM)
         self.point_attention = PointAttention(channels, limits.max_points) if cpa == "point" else None

@@ -41,12 +41,12 @@ class LossTerms(NamedTuple):
 
     @property
     def total(self) -> Tensor:
-        """Eq. (15), the unitless scalar that training minimizes."""
+        """Total loss, eq. (15), a unitless scalar."""
         return self.box + self.classification + self.direction
 
 
 def detection_loss(maps: HeadMaps[Tensor], targets: TargetBatch, config: LossConfig) -> LossTerms:
-    """Eq. (15): focal loss over anchors, smooth L1 and direction over the positive ones, per positive anchor.
+    """Compute eq. (15): focal loss over anchors, smooth L1 and direction over the positive ones, per positive anchor.
 
     Args:
         maps: scores (B, A, H, W), or (B, A * classes, H, W), boxes (B, 7A, H, W), directions (B, 2A, H, W); or rows
@@ -75,7 +75,7 @@ def detection_loss(maps: HeadMaps[Tensor], targets: TargetBatch, config: LossCon
 
 
 def states_by_class(state: Tensor, scores: int) -> Tensor:
-    """What each of an anchor's class logits should say: (..., A) -> (anchors, scores), as `TargetBatch.state`.
+    """Return the training state of each class logit: (..., A) -> (anchors, scores), as `TargetBatch.state`.
 
     With one score it is the anchor's own. With one for each class a positive anchor is a negative of the others.
     """
@@ -89,7 +89,7 @@ def states_by_class(state: Tensor, scores: int) -> Tensor:
 
 
 def targets_at(targets: TargetBatch, cells: Tensor) -> TargetBatch:
-    """The targets of the anchors at M active head cells; the others take no part.
+    """Return the targets of the anchors at M active head cells; the loss ignores others.
 
     Args:
         targets: of whole maps.
@@ -113,7 +113,7 @@ def targets_at(targets: TargetBatch, cells: Tensor) -> TargetBatch:
 
 
 def focal_loss(logits: Tensor, state: Tensor, alpha: float, gamma: float) -> Tensor:
-    """Eq. (14), summed: binary focal loss (arXiv 1708.02002) where `state` is 1 or 0, nothing where it is -1.
+    """Compute eq. (14), summed: binary focal loss (arXiv 1708.02002) where `state` is 1 or 0, nothing where it is -1.
 
     Both are (B, H, W, A); the loss is a scalar.
     """
@@ -125,7 +125,7 @@ def focal_loss(logits: Tensor, state: Tensor, alpha: float, gamma: float) -> Ten
 
 
 def quality_focal_loss(logits: Tensor, state: Tensor, quality: Tensor, alpha: float, gamma: float) -> Tensor:
-    """Eq. (2) of Generalized Focal Loss (arXiv 2006.04388), summed: where `state` is 1 a score is to be `quality`.
+    """Compute eq. (2) of Generalized Focal Loss (arXiv 2006.04388), summed: `quality` is the target of positives.
 
     With eq. (14)'s weights of positive and negative anchors, which that paper leaves out: where every quality is 1 this
     is `focal_loss`.
@@ -142,9 +142,9 @@ def quality_focal_loss(logits: Tensor, state: Tensor, quality: Tensor, alpha: fl
 
 
 def overlaps_found(residuals: Tensor, targets: TargetBatch) -> Tensor:
-    """3D IoU of each positive anchor's predicted box with the one it is to find: (n, 7) -> (n,), without gradient."""
+    """Return the 3D IoU of positive anchors' predicted boxes with their targets: (n, 7) -> (n,), without gradient."""
     anchors, directions = targets.anchors.cpu().numpy(), targets.directions.cpu().numpy()
-    with np.errstate(over="ignore", invalid="ignore"):  # what overflows overlaps nothing
+    with np.errstate(over="ignore", invalid="ignore"):  # an overflowing box overlaps nothing
         # Half a turn changes no overlap, so the direction that is predicted does not matter.
         found, wanted = (
             decode_boxes(each.detach().cpu().numpy(), directions, anchors).astype(np.float64)
@@ -154,7 +154,7 @@ def overlaps_found(residuals: Tensor, targets: TargetBatch) -> Tensor:
 
 
 def box_loss(residuals: Tensor, targets: Tensor, beta: float) -> Tensor:
-    """Eq. (13), summed over residuals (K, 7): smooth L1 of six of them and of the sine of the yaw difference.
+    """Compute eq. (13), summed over residuals (K, 7): smooth L1 of six of them and of the sine of the yaw difference.
 
     The sine makes a box and the same box turned by half a circle equal; the direction bins tell them apart.
     """
@@ -164,6 +164,6 @@ def box_loss(residuals: Tensor, targets: Tensor, beta: float) -> Tensor:
 
 
 def _by_anchor(maps: Tensor, values: int) -> Tensor:
-    """(B, A * values, H, W) or (M, A * values) -> (anchors, values), in the order of the targets."""
+    """Reshape (B, A * values, H, W) or (M, A * values) to (anchors, values), in the order of the targets."""
     rows = maps if maps.ndim == 2 else maps.permute(0, 2, 3, 1)
     return rows.reshape(-1, values)

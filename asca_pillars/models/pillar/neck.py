@@ -18,14 +18,14 @@ assert math.prod(_STRIDES) == NECK_STRIDE, "what the grid is made for"
 
 
 class RPNNeck(MapBackbone):
-    """The neck of Table 1, everywhere on the map: three blocks that halve it, 384 channels with Table 1's widths."""
+    """Dense neck of Table 1: three blocks that halve the map, 384 channels with Table 1's widths."""
 
     def __init__(self, *widths: Any) -> None:
         super().__init__(*widths, strides=_STRIDES, head_stride=HEAD_STRIDE)
 
 
 class SparseRPNNeck(MapBackbone):
-    """The same neck, computed at active cells alone; its weights have the names and shapes of `RPNNeck`'s.
+    """`RPNNeck` computed at active cells only; its weights have the same names and shapes.
 
     Batch normalization is over active cells. A convolution's missing inputs are zero, and so are the upsampled values
     of a level at head cells where only another level is active.
@@ -42,7 +42,7 @@ class SparseRPNNeck(MapBackbone):
         self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
     def forward(self, pillars: Tensor, tables: NeckRulebooks[Tensor]) -> Tensor:  # type: ignore[override]
-        """Unitless features of pillars (P, C) -> (M, out_channels) at M active head cells."""
+        """Apply the neck: unitless features of pillars (P, C) -> (M, out_channels) at M active head cells."""
         maps = []
         for block, deblock, level in zip(self.blocks, self.deblocks, tables.levels, strict=True):
             for number, (convolution, norm) in enumerate(block_layers(block)):
@@ -56,7 +56,7 @@ class SparseRPNNeck(MapBackbone):
         return torch.cat(maps, dim=1)
 
     def forward_dense(self, canvas: Tensor, tables: NeckRulebooks[Tensor]) -> Tensor:
-        """The same function by dense convolutions with masks: pseudo-image (B, C, ny, nx) -> (M, out_channels)."""
+        """Compute `forward` by dense convolutions with masks: pseudo-image (B, C, ny, nx) -> (M, out_channels)."""
         maps = []
         for block, deblock, level in zip(self.blocks, self.deblocks, tables.levels, strict=True):
             for number, (convolution, norm) in enumerate(block_layers(block)):
@@ -70,13 +70,13 @@ class SparseRPNNeck(MapBackbone):
 
 
 def block_layers(block: nn.Module) -> Iterator[tuple[Any, Any]]:
-    """Each convolution of a block, and the normalization that follows it."""
+    """Return each convolution of a block with the normalization that follows it."""
     children = list(block.children())
     return zip(children[0::3], children[1::3], strict=True)
 
 
 def _upsampled(deblock: nn.Module, features: Tensor, places: Tensor) -> Tensor:
-    """A deblock at active parents (N, C), read at head cells: (M, upsample_channels)."""
+    """Apply a deblock at active parents (N, C), and read it at head cells: (M, upsample_channels)."""
     transposed, norm, _ = deblock.children()
     assert isinstance(transposed, nn.ConvTranspose2d)
     by_place = transposed.weight.movedim(1, -1).flatten(1).T  # (stride^2 * channels, C)

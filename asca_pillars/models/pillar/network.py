@@ -1,4 +1,4 @@
-"""The whole network between pillars and head maps, and its side of training (`models.trainable.Trainable`)."""
+"""Network from pillars to head maps, with its training interface (`models.trainable.Trainable`)."""
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -23,11 +23,11 @@ from asca_pillars.ops.pillar.spec import PillarSpec
 
 
 class PillarOutputs(NamedTuple):
-    """What the network says of B frames.
+    """Outputs of the network for B frames.
 
     Attributes:
         maps: head maps, or rows of the active head cells of a sparse neck, see `SSDHead`.
-        neck: the tables that say which cells those are; None for maps.
+        neck: the rulebooks with the indices of these cells; None for maps.
     """
 
     maps: HeadMaps[Tensor]
@@ -39,7 +39,7 @@ class PillarDetector(Trainable):
 
     Args:
         spec: grid, limits and classes that its parts were made for.
-        loss_weights: what training weighs its terms with.
+        loss_weights: weights of the loss terms.
         encode: points of pillars to pillar features (section 3.2).
         neck: pseudo-image, or pillars and tables, to features (section 3.3).
         head: features to head maps.
@@ -65,7 +65,7 @@ class PillarDetector(Trainable):
         self.head = head
 
     def forward(self, batch: PillarBatch) -> HeadMaps[Tensor]:
-        """Pillars of B frames -> head maps (B, channels, H, W) of logits and residuals.
+        """Apply the network: pillars of B frames -> head maps (B, channels, H, W) of logits and residuals.
 
         With a sparse neck: rows (M, channels) of the active head cells, see `SSDHead`.
 
@@ -75,7 +75,7 @@ class PillarDetector(Trainable):
         return self.read_head(self.head_input(batch), batch)
 
     def head_input(self, batch: PillarBatch) -> Tensor:
-        """What the neck hands to the head: unitless (B, C, H, W), with a sparse neck (M, C) at active head cells."""
+        """Return the neck's output: unitless (B, C, H, W), with a sparse neck (M, C) at active head cells."""
         pillar_features = self.encode(
             batch.features, batch.pillar_index, batch.point_counts, batch.frame_pillars
         )  # (P, C)
@@ -89,16 +89,16 @@ class PillarDetector(Trainable):
         return self.neck(canvas)  # type: ignore[no-any-return]
 
     def read_head(self, features: Tensor, batch: PillarBatch) -> HeadMaps[Tensor]:
-        """Head maps of what `head_input` gave for that batch, or rows of them, see `forward`."""
+        """Apply the head to the result of `head_input` for that batch: maps, or rows of them, see `forward`."""
         if batch.neck is not None:
             return self.head.at_cells(features)
         maps: HeadMaps[Tensor] = self.head(features)
         return maps
 
     def predict(self, batch: LabeledPillars) -> PillarOutputs:
-        """Head maps (B, channels, H, W) of logits and residuals of B labelled frames, and their cells.
+        """Return head maps (B, channels, H, W) of logits and residuals of B labelled frames, and their cells.
 
-        Where some normalization would see a single point or cell, those of the training so far are used instead.
+        Where a normalization would see a single point or cell, its running statistics are used.
         """
         pillars, neck = batch.pillars, batch.pillars.neck
         rows = [len(pillars.features)]
@@ -108,16 +108,16 @@ class PillarDetector(Trainable):
             return PillarOutputs(self(pillars), neck)
 
     def loss(self, outputs: PillarOutputs, batch: LabeledPillars) -> Mapping[str, Tensor]:
-        """The terms of eq. (15) by name, unitless scalars, from head maps (B, channels, H, W), see `detection_loss`.
+        """Return the terms of eq. (15) by name, unitless, from head maps (B, channels, H, W), see `detection_loss`.
 
-        Anchors at inactive head cells take no part.
+        Anchors at inactive head cells are left out.
         """
         neck, targets = outputs.neck, batch.targets
         seen = targets if neck is None else targets_at(targets, neck.head_cells)
         return detection_loss(outputs.maps, seen, self.loss_weights)._asdict()
 
     def detect(self, outputs: PillarOutputs, spec: DetectorSpec) -> list[Detections]:
-        """Boxes in head maps (B, channels, H, W) for each frame, LiDAR frame, with the thresholds of `spec`."""
+        """Return boxes in head maps (B, channels, H, W) for each frame, LiDAR frame, with the thresholds of `spec`."""
         arrays = [part.float().cpu().numpy() for part in outputs.maps]
         neck = outputs.neck
         if neck is None:
@@ -131,7 +131,7 @@ class PillarDetector(Trainable):
         return found
 
     def pool(self, pillar_features: Tensor, batch: PillarBatch) -> tuple[Tensor, Tensor, Sequence[int]]:
-        """Pillar features (P, C) -> features (M, C) and cells (M,) of the map, and how many each frame has.
+        """Pool pillar features (P, C) -> features (M, C) and cells (M,) of the map, and their number in each frame.
 
         See `ops.pillar.grid`; without a pooled map pillars and cells are the same.
         """
@@ -155,9 +155,9 @@ class PillarDetector(Trainable):
 
 @contextmanager
 def _running_statistics(module: nn.Module) -> Iterator[None]:
-    """Normalize by the statistics of the training so far: a single value per channel has none of its own.
+    """Normalize by running statistics within the block, because a single value per channel has no variance.
 
-    `SyncBatchNorm` stays as it is: other devices wait for it, and it has their values, too.
+    `SyncBatchNorm` is not changed: other devices wait for it, and its statistics include theirs.
     """
     norms = [part for part in module.modules() if isinstance(part, nn.BatchNorm1d | nn.BatchNorm2d)]
     training = [norm for norm in norms if norm.training]
@@ -171,7 +171,7 @@ def _running_statistics(module: nn.Module) -> Iterator[None]:
 
 
 def build_pillar_detector(model: PillarModel) -> PillarDetector:
-    """The network that `model` describes, with fresh random weights."""
+    """Build the network that `model` describes, with fresh random weights."""
     network, spec = model.network, model.spec
     widths = network.pillar_channels, network.block_channels, network.block_convs, network.upsample_channels
     neck: RPNNeck | SparseRPNNeck

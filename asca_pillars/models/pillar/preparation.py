@@ -20,7 +20,7 @@ from asca_pillars.ops.pillar.spec import PillarSpec
 
 
 class Placement(NamedTuple):
-    """What the neck is told of where a frame's pillars stand.
+    """Positions of a frame's pillars on the map, as the neck takes them.
 
     Attributes:
         pooling: of a pooled map; None where pillars and cells are the same.
@@ -32,7 +32,7 @@ class Placement(NamedTuple):
 
 
 class TargetedPillars(NamedTuple):
-    """One frame: its pillars, where they stand on the map, and the targets of its anchors."""
+    """One frame: its pillars, their positions on the map, and the targets of its anchors."""
 
     pillars: Pillars
     placement: Placement
@@ -71,7 +71,7 @@ class LabeledPillars(NamedTuple):
     targets: TargetBatch
 
     def to(self, device: Any) -> "LabeledPillars":
-        """The same with its tensors on `device`."""
+        """Return the batch with its tensors on `device`."""
         moved: LabeledPillars = tree_map_only(Tensor, lambda tensor: tensor.to(device), self)
         return moved
 
@@ -91,7 +91,7 @@ class PillarPreparation:
     assigner: Assigner = "overlap"
 
     def prepare(self, frame: LabeledFrame, rng: np.random.Generator | None) -> TargetedPillars:
-        """Pillars of a frame and the targets of its anchors; nothing is drawn."""
+        """Return the pillars of a frame and the targets of its anchors; nothing is random."""
         spec = self.spec
         frame = within_ranges(frame, spec.ranges)
         pillars = spec.pillarize(frame.points)
@@ -101,14 +101,14 @@ class PillarPreparation:
         return TargetedPillars(pillars, self.place(pillars), targets)
 
     def collate(self, frames: Sequence[TargetedPillars]) -> LabeledPillars:
-        """Frames as one batch."""
+        """Collate frames into one batch."""
         return LabeledPillars(
             batch_pillars([frame.pillars for frame in frames], [frame.placement for frame in frames]),
             batch_targets([frame.targets for frame in frames]),
         )
 
     def place(self, pillars: Pillars) -> Placement:
-        """What the neck reads besides the features: tables of indices (M, 9), and where pillars go on the map."""
+        """Return the map cells of the pillars and, for a sparse neck, the rulebooks: indices (M, 9)."""
         grid = self.spec.grid
         pooling = map_cells(pillars.cells, grid)
         if self.active_cells is None:
@@ -118,7 +118,7 @@ class PillarPreparation:
 
 
 def batch_pillars(frames: Sequence[Pillars], placements: Sequence[Placement] = ()) -> PillarBatch:
-    """Pillars of several frames, one frame's after the other's.
+    """Concatenate the pillars of several frames.
 
     Args:
         frames: at least one, each with features (M, 9), positions among them in metres, and flat indices (P,).
@@ -168,7 +168,7 @@ def _batch_poolings(
 
 
 def batch_targets(frames: Sequence[Targets]) -> TargetBatch:
-    """Targets of the anchors of several frames, one frame's after the other's."""
+    """Concatenate the anchor targets of several frames."""
     anchors_per_frame = frames[0].state.size
     return TargetBatch(
         state=torch.from_numpy(np.stack([frame.state for frame in frames])),

@@ -1,4 +1,4 @@
-"""What papers after PV-RCNN add around a keypoint: adaptive scales (AFE-RCNN, 3.2) and adaptive deformation."""
+"""Extensions of PV-RCNN's keypoint features: adaptive scales (AFE-RCNN, 3.2) and adaptive deformation."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -11,13 +11,13 @@ from asca_pillars.models.two_stage.sets import SetAbstraction, first_occurrences
 from asca_pillars.ops.points.neighbors import PointScale
 
 _SHARE = 4  # by which the impact's hidden layer is narrower, which the paper does not give
-_INITIAL_STD = 1e-3  # of the impact's last weights: training starts at features that are hardly adjusted
+_INITIAL_STD = 1e-3  # std of the last layer's initial weights: training starts at nearly unadjusted features
 
 
 class Adjustment(nn.Module):
     """F'_i = F_i + MLP(F_i) F_i + sum over the others of MLP(F_i - F_j) (F_i - F_j), channel by channel (eq. 6 to 10).
 
-    What PointWeb (CVPR 2019) calls adaptive feature adjustment.
+    PointWeb (CVPR 2019) calls it adaptive feature adjustment.
     """
 
     def __init__(self, channels: int) -> None:
@@ -28,7 +28,7 @@ class Adjustment(nn.Module):
         nn.init.zeros_(self.out.bias)
 
     def forward(self, features: Tensor, counted: Tensor) -> Tensor:
-        """Unitless features of groups (M, T, C) -> the same shape.
+        """Adjust unitless features of groups (M, T, C) -> the same shape.
 
         Args:
             features: F.
@@ -43,7 +43,7 @@ class Adjustment(nn.Module):
 
 
 class AdaptiveScales(nn.Module):
-    """A feature of each keypoint from groups of points at several scales, the coarse ones interpolated (eq. 11 to 13).
+    """Keypoint features from groups of points at several scales, the coarse ones interpolated (eq. 11 to 13).
 
     Args:
         in_channels: of a raw point besides its position.
@@ -60,7 +60,7 @@ class AdaptiveScales(nn.Module):
         self.out_channels = out_channels
 
     def forward(self, points: Tensor, scales: Sequence[PointScale[Tensor]]) -> Tensor:
-        """Points (N, 3 + in_channels), x, y, z in metres, and their scales -> features (K, out_channels)."""
+        """Encode points (N, 3 + in_channels), x, y, z in metres, and their scales -> features (K, out_channels)."""
         positions, features, found = points[:, :3], points[:, 3:], []
         for lift, adjust, scale in zip(self.lift, self.adjust, scales, strict=True):
             assert isinstance(lift, SetAbstraction)
@@ -76,14 +76,14 @@ class AdaptiveScales(nn.Module):
 
 
 def _interpolated(features: Tensor, scale: PointScale[Tensor]) -> Tensor:
-    """(M, C) at a scale's positions -> (_, C) at those of the scale before."""
+    """Interpolate (M, C) at a scale's positions -> (_, C) at those of the scale before."""
     padded = F.pad(features, (0, 0, 0, 1))
     near = padded.index_select(0, scale.nearest.reshape(-1)).unflatten(0, scale.nearest.shape)
     return (near * scale.nearest_weights[:, :, None]).sum(dim=1)
 
 
-_OFFSET_CHANNELS = 16  # of f', which the paper does not give
-_ALIGN_STD = 1e-3  # of the last weights: training starts at almost undeformed keypoints, and all weights learn
+_OFFSET_CHANNELS = 16  # channels of f', which the paper does not give
+_ALIGN_STD = 1e-3  # std of the last initial weights: training starts at almost undeformed keypoints, with gradients
 
 
 class Surroundings(NamedTuple):
@@ -116,7 +116,7 @@ class PaperDeformation(nn.Module):
         nn.init.normal_(self.align.weight, std=_ALIGN_STD)
 
     def forward(self, around: Surroundings) -> list[Tensor]:
-        """One list entry (K, 3), metres."""
+        """Return a list of one entry (K, 3), metres."""
         assert around.nearest is not None and around.nearest_weights is not None
         index = around.indices[-1]
         offsets = F.pad(self.offset(around.features), (0, 0, 0, 1))  # linear: W (f_i - f_j) = W f_i - W f_j
@@ -139,7 +139,7 @@ class AuthorsDeformation(nn.Module):
         self.offset = nn.Linear(3 + channels, 3, bias=False)
 
     def forward(self, around: Surroundings) -> list[Tensor]:
-        """(K, 3) per radius, metres."""
+        """Return (K, 3) per radius, metres."""
         shifted = []
         for index in around.indices:
             relative, found = _relative(around, index)
@@ -151,12 +151,12 @@ class AuthorsDeformation(nn.Module):
 
 
 def _gathered(rows: Tensor, index: Tensor) -> Tensor:
-    """(N, C) by (K, T) -> (K, T, C)."""
+    """Gather (N, C) by (K, T) -> (K, T, C)."""
     return rows.index_select(0, index.reshape(-1)).unflatten(0, index.shape)
 
 
 def _relative(around: Surroundings, index: Tensor) -> tuple[Tensor, Tensor]:
-    """v_j - v_i (K, T, 3), zeros where there is nothing, and whether there is something (K, T)."""
+    """Return v_j - v_i (K, T, 3), zeros for empty entries, and a mask of the others (K, T)."""
     found = (index < around.positions.shape[0]).to(around.positions.dtype)
     positions = _gathered(F.pad(around.positions, (0, 0, 0, 1)), index)
     return (positions - around.keypoints[:, None]) * found[:, :, None], found

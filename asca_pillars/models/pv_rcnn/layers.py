@@ -1,4 +1,4 @@
-"""PV-RCNN (arXiv 1912.13192): voxels propose, keypoints refine."""
+"""Layers and network of PV-RCNN (arXiv 1912.13192)."""
 
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
@@ -48,12 +48,12 @@ class DualAttention(nn.Module):
         self.place_query = nn.Conv2d(channels, half, 1)
 
     def forward(self, features: Tensor) -> Tensor:
-        """Unitless (B, C, H, W) -> the same shape."""
+        """Apply the attention: unitless (B, C, H, W) -> the same shape."""
         attended = self.by_place(self.by_channel(features))
         return features + _RESIDUAL_WEIGHT * attended if self.residual else attended
 
     def by_channel(self, features: Tensor) -> Tensor:
-        """Eq. (1) and (2): a weight in (0, 1) for each channel of unitless (B, C, H, W)."""
+        """Return eq. (1) and (2): a weight in (0, 1) for each channel of unitless (B, C, H, W)."""
         values = self.channel_value(features).flatten(2)  # (B, C / 2, HW)
         shares = torch.softmax(self.channel_query(features).flatten(2), dim=2)  # (B, 1, HW)
         pooled = (values @ shares.transpose(1, 2))[:, :, 0]
@@ -61,7 +61,7 @@ class DualAttention(nn.Module):
         return features * weights[:, :, None, None]
 
     def by_place(self, features: Tensor) -> Tensor:
-        """Eq. (3) and (4): a weight in (0, 1) for each place of unitless (B, C, H, W)."""
+        """Return eq. (3) and (4): a weight in (0, 1) for each place of unitless (B, C, H, W)."""
         values = self.place_value(features)  # (B, C / 2, H, W)
         shares = torch.softmax(self.place_query(features).mean(dim=(2, 3)), dim=1)  # (B, C / 2)
         return features * torch.sigmoid((values * shares[:, :, None, None]).sum(dim=1, keepdim=True))
@@ -79,12 +79,12 @@ class SparseConvBlock(nn.Module):
         self.norm = nn.BatchNorm1d(channels, eps=NORM_EPS, momentum=NORM_MOMENTUM)
 
     def forward(self, features: Tensor, table: Tensor, back: Tensor | None = None) -> Tensor:
-        """Unitless (N, in_channels) -> (M, channels), see `rulebook_conv`."""
+        """Apply the block: unitless (N, in_channels) -> (M, channels), see `rulebook_conv`."""
         return torch.relu(self.norm(rulebook_conv(features, self.convolution.weight, table, back)))
 
 
 class VoxelBackbone(nn.Module):
-    """conv1 to conv4 and conv_out: each level halves the lattice before it.
+    """Sparse 3D backbone, conv1 to conv4 and conv_out; each level halves the lattice before it.
 
     Args:
         in_channels: of a voxel.
@@ -109,7 +109,7 @@ class VoxelBackbone(nn.Module):
         self.out_channels = out
 
     def forward(self, features: Tensor, levels: Sequence[VoxelLevel[Tensor]]) -> list[Tensor]:
-        """Voxel features (N, in_channels) -> unitless features (M, channels) of the active cells of every level."""
+        """Encode voxel features (N, in_channels) -> unitless (M, channels) of the active cells of every level."""
         found = []
         for number, level in enumerate(levels):
             if number:
@@ -126,24 +126,24 @@ _BLOCK_STRIDES = (1, 2)
 
 
 class FirstStageOutputs(NamedTuple):
-    """What the voxels say."""
+    """Outputs of the first stage."""
 
     levels: list[Tensor]
     """Features (M, channels) of the active voxels of every level."""
     canvas: Tensor
-    """(B, H, W, C) conv_out seen from above, what the map's backbone reads."""
+    """(B, H, W, C) conv_out as a bird's-eye-view map, the input of the 2D backbone."""
     maps: HeadMaps[Tensor]
     """Scores (B, A * classes, H, W), boxes (B, 7A, H, W), directions (B, 2A, H, W)."""
 
 
 class PvRcnn(nn.Module):
-    """The network.
+    """Network of PV-RCNN.
 
     Args:
         spec: grid, strides and classes that its parts were made for.
         settings: its sources, likewise.
         voxels: the sparse 3D backbone.
-        neck: the backbone on the map seen from above.
+        neck: the 2D backbone on the bird's-eye-view map.
         head: of the anchors, each with a score for every class.
         encode: voxel set abstraction and keypoint weighting (sections 3.2 and 3.3).
         refine: RoI-grid pooling and the second stage's heads (section 3.4).
@@ -175,14 +175,14 @@ class PvRcnn(nn.Module):
         self.scales = scales
 
     def propose(self, batch: VoxelBatch[Tensor]) -> FirstStageOutputs:
-        """Voxels (N, 4), metres and reflectance -> unitless features (M, C) of every level, and head maps."""
+        """Encode voxels (N, 4), metres and reflectance -> unitless features (M, C) of every level, and head maps."""
         levels = self.voxels(batch.features, batch.levels)
         canvas = self.scatter(levels[-1], batch.levels[-1].cells, len(batch.frame_keypoints))
         maps: HeadMaps[Tensor] = self.head(self.neck(as_map(canvas)))
         return FirstStageOutputs(levels, canvas, maps)
 
     def scatter(self, features: Tensor, cells: Tensor, frames: int) -> Tensor:
-        """conv_out's voxels, one above the other, as channels of a map: (M, C) -> (B, H, W, nz * C), z-major.
+        """Scatter the voxels of conv_out to a map, z-major in its channels: (M, C) -> (B, H, W, nz * C).
 
         Args:
             features: of the active cells of conv_out.
@@ -196,7 +196,7 @@ class PvRcnn(nn.Module):
     def encode_keypoints(
         self, batch: VoxelBatch[Tensor], levels: Sequence[Tensor], canvas: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Weighted features (K, C) of the keypoints, and logits (K,) of their being part of an object."""
+        """Return weighted features (K, C) of the keypoints, and foreground logits (K,)."""
         cells = canvas.flatten(0, 2)
         bev = sum(
             cells.index_select(0, batch.bev_cells[:, corner]) * batch.bev_weights[:, corner, None]
@@ -223,7 +223,7 @@ class PvRcnn(nn.Module):
         return features, logits
 
     def deformed_places(self, batch: VoxelBatch[Tensor], levels: Sequence[Tensor]) -> dict[str, list[Tensor]]:
-        """Around which places (K, 3), metres, keypoints look at each deformed source: one, or one for each radius."""
+        """Return shifted positions (K, 3), metres, of keypoints for each deformed source: one, or one per radius."""
         places, first = {}, 0
         for number, each in enumerate(self.settings.sources):
             balls = batch.ball_indices[first : first + len(each.radii_m)]
@@ -246,7 +246,7 @@ def _source_features(source: Source, points: Tensor, levels: Sequence[Tensor]) -
 
 
 def build_pv_rcnn(model: PvRcnnModel) -> PvRcnn:
-    """The network that `model` describes, with fresh random weights."""
+    """Build the network that `model` describes, with fresh random weights."""
     network, spec, settings = model.network, model.spec, model.settings
     channels = {"points": POINT_CHANNELS - 3, **dict(zip(LEVEL_SOURCES, network.voxel_channels[:-1], strict=True))}
     map_channels = network.voxel_channels[-1] * spec.level_shapes[-1][0]

@@ -1,4 +1,4 @@
-"""PV-RCNN's side of training (`models.trainable.Trainable`): both stages in one step, as in the paper (section 3.4)."""
+"""Training interface of PV-RCNN (`models.trainable.Trainable`): both stages in one step (paper, section 3.4)."""
 
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
@@ -29,14 +29,14 @@ _DISTANCE_IOU_WEIGHT = 0.3  # alpha of AFE-RCNN's eq. (14)
 
 
 class PvRcnnOutputs(NamedTuple):
-    """What both stages say of B frames."""
+    """Outputs of both stages for B frames."""
 
     maps: HeadMaps[Tensor]
-    """Of the first stage."""
+    """Head maps of the first stage."""
     found: Refinements
-    """Of the second, about `proposals`."""
+    """Refinements of `proposals` by the second stage."""
     proposals: tuple[Detections, ...]
-    """Of each frame: in training those drawn, otherwise all."""
+    """Proposals of each frame: in training the sampled ones, otherwise all."""
 
 
 class PvRcnnDetector(Trainable):
@@ -61,14 +61,14 @@ class PvRcnnDetector(Trainable):
         self.train()  # Lightning gives back the modes that it found
 
     def train(self, mode: bool = True) -> "PvRcnnDetector":
-        """As of `torch.nn.Module`; a first stage that is not trained keeps its statistics."""
+        """Set the mode as `torch.nn.Module.train` does; a first stage that is not trained keeps its statistics."""
         super().train(mode)
         for part in self._kept:
             part.eval()
         return self
 
     def predict(self, batch: LabeledVoxels) -> PvRcnnOutputs:
-        """Head maps, proposals and their refinements; training draws the proposals that it learns from."""
+        """Return head maps, proposals and their refinements; in training, proposals are sampled."""
         scans = batch.scans
         if self.training and min(len(scans.keypoints), *(len(level.cells) for level in scans.levels)) < 2:
             return self._zero_outputs(scans)  # no statistics of a batch
@@ -79,7 +79,7 @@ class PvRcnnDetector(Trainable):
         return PvRcnnOutputs(first.maps, found, proposals)
 
     def loss(self, outputs: PvRcnnOutputs, batch: LabeledVoxels) -> Mapping[str, Tensor]:
-        """The terms of what is trained by name, see `detection_loss` and `refine_loss`, all of weight 1."""
+        """Return loss terms of the trained parts by name, see `detection_loss` and `refine_loss`, all of weight 1."""
         device = outputs.found.confidence.device
         first = {} if self._kept else detection_loss(outputs.maps, batch.anchors, self.loss_weights)._asdict()
         targets, learnt = _roi_targets(outputs.proposals, batch)
@@ -96,7 +96,7 @@ class PvRcnnDetector(Trainable):
         return terms
 
     def detect(self, outputs: PvRcnnOutputs, spec: DetectorSpec) -> list[Detections]:
-        """Refined boxes of each frame, with the thresholds of `spec`."""
+        """Return refined boxes of each frame, with the thresholds of `spec`."""
         confidence, residuals = (part.float().cpu().numpy() for part in outputs.found[:2])
         return reported_frames(outputs.proposals, confidence, residuals, spec, self.model.scores)
 
@@ -152,7 +152,7 @@ class PvRcnnDetector(Trainable):
         return Refinements(confidence, residuals, keypoint_logits)
 
     def _zero_outputs(self, scans: VoxelBatch[Tensor]) -> PvRcnnOutputs:
-        """Zeros that every weight has a gradient of zero from, as training on several devices wants it."""
+        """Return zero outputs that give every weight a gradient of zero, as distributed training requires."""
         nothing, frames = zero_of_weights(self), len(scans.frame_keypoints)
         height, width, anchors, _ = self.model.spec.anchors.shape
         classes = len(self.model.spec.classes)
@@ -168,7 +168,7 @@ class PvRcnnDetector(Trainable):
 def _roi_targets(
     proposals: Sequence[Detections], batch: LabeledVoxels
 ) -> tuple[tuple[NDArray[np.generic], ...], NDArray[np.bool_]]:
-    """Confidence, positive, residuals and sizes (R, ...) of all proposals, and which of them are learnt from (R,)."""
+    """Return confidence, positive, residuals, sizes (R, ...) of all proposals, and a mask (R,) of those sampled."""
     parts, learnt = [], []
     for frame, boxes, labels in zip(proposals, batch.boxes, batch.labels, strict=True):
         overlaps = match_proposals(frame, boxes, labels)
@@ -179,5 +179,5 @@ def _roi_targets(
 
 
 def build_pv_rcnn_detector(model: PvRcnnModel) -> PvRcnnDetector:
-    """The detector that `model` describes, with fresh random weights."""
+    """Build the detector that `model` describes, with fresh random weights."""
     return PvRcnnDetector(model, build_pv_rcnn(model))

@@ -1,4 +1,4 @@
-"""Labelled frames to batches of PV-RCNN, whose indices count through the batch."""
+"""Batches of PV-RCNN from labelled frames; indices count through the batch."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -40,7 +40,7 @@ class VoxelBatch(NamedTuple, Generic[Array]):
     ball_indices: tuple[Array, ...]
     """(K, samples), source by source and radius by radius."""
     nearest: tuple[Array, ...]
-    """(K, 3) voxels per source, (0, 3) where they are not asked for."""
+    """(K, 3) voxels per source, (0, 3) where they are not needed."""
     nearest_weights: tuple[Array, ...]
     """(K, 3)."""
     bev_cells: Array
@@ -56,7 +56,7 @@ class VoxelBatch(NamedTuple, Generic[Array]):
 
 
 class LabeledVoxels(NamedTuple):
-    """B scans, what their anchors and keypoints should say, and the boxes that the other targets follow from."""
+    """B scans, the targets of their anchors and keypoints, and the boxes for the other targets."""
 
     scans: VoxelBatch[Tensor]
     anchors: TargetBatch
@@ -68,13 +68,13 @@ class LabeledVoxels(NamedTuple):
     """(M,) per frame, or IGNORED."""
 
     def to(self, device: Any) -> "LabeledVoxels":
-        """The same with its tensors on `device`."""
+        """Return the batch with its tensors on `device`."""
         moved: LabeledVoxels = tree_map_only(Tensor, lambda tensor: tensor.to(device), self)
         return moved
 
 
 def batch_scans(scans: Sequence[VoxelScan], spec: VoxelSpec) -> VoxelBatch[Tensor]:
-    """Several scans, at least one, as one batch."""
+    """Batch several scans, at least one."""
     levels = stack_voxel_levels([scan.levels for scan in scans], spec.level_shapes)
     sources = range(len(scans[0].positions))
     frame_rows = tuple(tuple(len(scan.positions[source]) for scan in scans) for source in sources)
@@ -121,7 +121,7 @@ def _stack_scales(scans: Sequence[VoxelScan]) -> tuple[PointScale[NDArray[Any]],
 def deformed_balls(
     batch: VoxelBatch[Tensor], settings: VoxelSetSettings, places: Mapping[str, Sequence[Tensor]]
 ) -> tuple[list[Tensor], list[Tensor]]:
-    """Indices (K, samples) and centers (K, 3), metres, of all balls; deformed sources' around `places`."""
+    """Return indices (K, samples) and centers (K, 3), metres, of all balls; deformed sources' around `places`."""
     indices, centers, given = [], [], iter(batch.ball_indices)
     for number, each in enumerate(settings.sources):
         for radius, (radius_m, samples) in enumerate(zip(each.radii_m, each.samples, strict=True)):
@@ -164,7 +164,7 @@ class VoxelPreparation:
     settings: VoxelSetSettings
 
     def prepare(self, frame: LabeledFrame, rng: np.random.Generator | None) -> TargetedVoxels:
-        """Voxels, tables, keypoints and targets of a frame; nothing is drawn."""
+        """Return voxels, rulebooks, keypoints and targets of a frame; nothing is random."""
         spec = self.spec
         frame = within_ranges(frame, spec.ranges)
         points = frame.points[np.isfinite(frame.points).all(axis=1)]
@@ -184,7 +184,7 @@ class VoxelPreparation:
         )
 
     def collate(self, frames: Sequence[TargetedVoxels]) -> LabeledVoxels:
-        """Frames as one batch."""
+        """Collate frames into one batch."""
         return LabeledVoxels(
             batch_scans([frame.scan for frame in frames], self.spec),
             batch_targets([frame.targets for frame in frames]),

@@ -53,7 +53,7 @@ class TorchFirstStage:
         self.identity = found.identity or weights_sha256(self._network.state_dict())
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Sent to another process, it is read there."""
+        """Pickle as its source, from which the other process reads it."""
         return open_first_stage, (self._source,)
 
     def __call__(self, points: NDArray[np.float32]) -> FirstPass:
@@ -71,12 +71,12 @@ class TorchFirstStage:
 
 
 def open_first_stage(source: str) -> FirstStage:
-    """The first stage of that name, opened once for as long as it stays the same, see `TorchFirstStage`.
+    """Return the first stage of that name, cached as long as its file stays the same, see `TorchFirstStage`.
 
     Raises:
         AscaError: as `TorchFirstStage`.
     """
-    path = Path(source)  # of a bundle the folder, which an export replaces as a whole
+    path = Path(source)  # for a bundle its folder, which an export replaces as a whole
     return _open_first_stage(source, path.stat().st_mtime_ns if path.exists() else 0)
 
 
@@ -86,7 +86,7 @@ def _open_first_stage(source: str, _changed_ns: int) -> FirstStage:
 
 
 def with_first_stage(model: RefineModel, stage: FirstStage | None = None) -> RefineModel:
-    """The model with all that its first stage says of itself: identity, spec, channels.
+    """Return the model with identity, spec and channels of its first stage.
 
     Args:
         model: of the second stage.
@@ -94,7 +94,7 @@ def with_first_stage(model: RefineModel, stage: FirstStage | None = None) -> Ref
 
     Raises:
         AscaError: as `open_first_stage`.
-        ConfigError: the model says something else of it.
+        ConfigError: the model states other properties of it.
     """
     stage = stage or open_first_stage(model.first_stage)
     if model.first_stage_identity not in ("", stage.identity):
@@ -122,17 +122,17 @@ def with_first_stage(model: RefineModel, stage: FirstStage | None = None) -> Ref
 
 
 def _geometry(spec: PillarSpec) -> PillarSpec:
-    """The spec without thresholds and suppression, which are the second stage's own."""
+    """Return the spec without thresholds and suppression, which are those of the second stage."""
     return replace(spec.with_score_threshold(0.0), post=PostProcess())
 
 
 class _Weights(NamedTuple):
-    """The checkpoint that a first stage is read from, and what its bundle says of it, if it lies in one."""
+    """Checkpoint of a first stage, with spec and identity of the bundle that holds it, if any."""
 
     path: Path
     spec: PillarSpec | None = None
     identity: str = ""
-    """Of the trained weights, of which the bundle's are rounded."""
+    """Identifier of the trained weights; the bundle's are rounded from them."""
 
 
 def _find_weights(source: str) -> _Weights:

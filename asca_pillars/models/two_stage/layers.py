@@ -11,20 +11,20 @@ from asca_pillars.models.two_stage.sets import SetAbstraction, VectorPool, mlp
 
 
 class BallSource(NamedTuple):
-    """What keypoints aggregate within balls: raw points, or the voxels of a level."""
+    """Source that keypoints aggregate within balls: raw points, or the voxels of a level."""
 
     channels: int
-    """Of a point besides its position."""
+    """Channels of a point besides its position."""
     radii: int
-    """How many balls around each keypoint."""
+    """Number of balls around each keypoint."""
     widths: Sequence[int]
-    """Of the MLP of each ball."""
+    """Widths of the MLP of each ball."""
     gated: bool = False
-    """Whether `ContextGate` chooses among its features."""
+    """True if its features pass through `ContextGate`."""
 
 
 class SourceRows(NamedTuple):
-    """The points of one source."""
+    """Points of one source."""
 
     positions: Tensor
     """(N, 3), metres, in the frame of the keypoints."""
@@ -41,17 +41,17 @@ class ContextGate(nn.Module):
         self.value = nn.Linear(channels, channels, bias=False)
 
     def forward(self, features: Tensor) -> Tensor:
-        """Unitless (K, C) -> (K, C)."""
+        """Apply the gate: unitless (K, C) -> (K, C)."""
         gated: Tensor = torch.sigmoid(self.gate(features)) * self.value(features)
         return gated
 
 
 class KeypointEncoder(nn.Module):
-    """What lies around a keypoint at several radii, and the first stage's map under it, fused and weighted.
+    """Keypoint features: balls of several radii and the first stage's map at the keypoint, fused and weighted.
 
     Args:
         sources: what is aggregated within balls.
-        bev_channels: of what is known of a keypoint besides, such as the first stage's map under it.
+        bev_channels: of a keypoint's other features, such as the first stage's map at its position.
         out_channels: of the fused feature.
         weighting_channels: of the hidden layers of the weighting.
     """
@@ -82,7 +82,7 @@ class KeypointEncoder(nn.Module):
         indices: Sequence[Tensor],
         centers: Sequence[Tensor] | None = None,
     ) -> tuple[Tensor, Tensor]:
-        """Weighted features (K, out_channels), and logits (K,) of a keypoint's being part of an object.
+        """Return weighted features (K, out_channels) of keypoints, and foreground logits (K,).
 
         Args:
             rows: of each source.
@@ -105,7 +105,7 @@ class KeypointEncoder(nn.Module):
 
 
 class RoiHead(nn.Module):
-    """Keypoints around the grid points of each proposal -> its confidence and its residuals.
+    """RoI-grid pooling of keypoints, and the heads of confidence and residuals.
 
     Args:
         pools: what aggregates the keypoints around a grid point, one for each radius.
@@ -143,7 +143,7 @@ class RoiHead(nn.Module):
         indices: Sequence[Tensor],
         roi_features: Tensor | None = None,
     ) -> tuple[Tensor, Tensor]:
-        """Confidence logits (R,) and residuals (R, 7), see `encode_refinement`.
+        """Return confidence logits (R,) and residuals (R, 7), see `encode_refinement`.
 
         Args:
             keypoints: (K, 3).
@@ -162,7 +162,7 @@ class RoiHead(nn.Module):
 
 
 class RefineInputs(NamedTuple):
-    """Points, keypoints and proposals of B frames, one frame's after the other's; indices count through the batch."""
+    """Points, keypoints and proposals of B frames, concatenated; indices count through the batch."""
 
     points: Tensor
     """(N, 4) x, y, z in metres, LiDAR frame, and reflectance."""
@@ -192,12 +192,12 @@ class Refinements(NamedTuple):
 
 
 def zero_of_weights(module: nn.Module) -> Tensor:
-    """A scalar 0 from which every weight has a gradient of zero."""
+    """Return a scalar 0 that gives every weight a gradient of zero."""
     return 0 * torch.stack([weight.sum() for weight in module.parameters()]).sum()
 
 
 class PillarRefiner(nn.Module):
-    """Keypoints from raw points and the first stage's map; RoI-grid pooling; confidence and residuals."""
+    """Second stage on pillars: keypoint encoding, RoI-grid pooling, confidence and residuals."""
 
     def __init__(self, encode: KeypointEncoder, head: RoiHead) -> None:
         super().__init__()

@@ -18,7 +18,7 @@ _LEAST_POSITIVE = 0.01
 
 
 class RefineTargets(NamedTuple):
-    """What the second stage should say; R proposals, K keypoints."""
+    """Training targets of the second stage; R proposals, K keypoints."""
 
     confidence: Tensor
     """(R,) in [0, 1]."""
@@ -47,7 +47,7 @@ class RefineTerms(NamedTuple):
 
 
 def refine_loss(found: Refinements, targets: RefineTargets) -> RefineTerms:
-    """BCE per proposal, smooth L1 and corners per positive proposal, focal loss per positive keypoint."""
+    """Compute BCE per proposal, smooth L1 and corners per positive proposal, focal loss per positive keypoint."""
     confidence = F.binary_cross_entropy_with_logits(found.confidence.float(), targets.confidence, reduction="sum")
     positive = targets.positive
     residuals, wanted = found.residuals.float()[positive], targets.residuals[positive]
@@ -65,10 +65,10 @@ def refine_loss(found: Refinements, targets: RefineTargets) -> RefineTerms:
 
 
 def corner_loss(residuals: Tensor, targets: Tensor, sizes: Tensor) -> Tensor:
-    """Smooth L1 of the way of each corner to where it should be, mean of eight: (R, 7), (R, 7), (R, 3) -> (R,).
+    """Return the mean smooth L1 distance of the eight corners: (R, 7), (R, 7), (R, 3) -> (R,).
 
-    In the frames of the proposals, which have these sizes. Of the wanted box and the same box turned by half a circle,
-    a corner is held to the nearer.
+    Corners are in the frames of the proposals, which have these sizes. Each is compared with the nearer one of the
+    target box and of the same box turned by half a circle.
     """
     found, wanted = corners_in_frames(residuals, sizes), corners_in_frames(targets, sizes)
     half_turn = torch.zeros_like(targets)
@@ -79,7 +79,7 @@ def corner_loss(residuals: Tensor, targets: Tensor, sizes: Tensor) -> Tensor:
 
 
 def distance_iou_loss(residuals: Tensor, targets: Tensor, sizes: Tensor) -> Tensor:
-    """1 - IoU + (distance of the centers / diagonal of the box around both)^2, seen from above (AFE-RCNN, eq. 17).
+    """1 - IoU + (distance of the centers / diagonal of the box around both)^2, in bird's-eye view (AFE-RCNN, eq. 17).
 
     Both boxes as rectangles along the axes of their proposals, which have these sizes: (R, 7), (R, 7), (R, 3) -> (R,).
     """
@@ -96,7 +96,7 @@ def distance_iou_loss(residuals: Tensor, targets: Tensor, sizes: Tensor) -> Tens
 
 
 def corners_in_frames(residuals: Tensor, sizes: Tensor) -> Tensor:
-    """Corners of refined boxes, seen from their proposals of these sizes: (R, 7), (R, 3) -> (R, 8, 3) metres.
+    """Return corners of refined boxes, seen from their proposals of these sizes: (R, 7), (R, 3) -> (R, 8, 3) metres.
 
     The order is that of `geometry.boxes.corners`; residuals as in `ops.two_stage.rois`.
     """
@@ -109,7 +109,7 @@ def corners_in_frames(residuals: Tensor, sizes: Tensor) -> Tensor:
 
 
 def _boxes_in_frames(residuals: Tensor, sizes: Tensor) -> tuple[Tensor, Tensor]:
-    """Centers and half sizes of refined boxes, seen from their proposals: (R, 7), (R, 3) -> 2 x (R, 3) metres."""
+    """Return centers and half sizes of refined boxes in the proposals' frames: (R, 7), (R, 3) -> 2 x (R, 3) metres."""
     diagonal = torch.hypot(sizes[:, 0], sizes[:, 1])
     center = torch.stack([residuals[:, 0] * diagonal, residuals[:, 1] * diagonal, residuals[:, 2] * sizes[:, 2]], dim=1)
     # Held as `decode_boxes` holds them: an untrained head must not make corners that are not finite.

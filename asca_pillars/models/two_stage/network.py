@@ -1,4 +1,4 @@
-"""The second stage's side of training (`models.trainable.Trainable`); the first stage stands outside it, frozen."""
+"""Training interface of the second stage (`models.trainable.Trainable`); the first stage is separate and frozen."""
 
 from collections.abc import Mapping
 from functools import cached_property
@@ -40,11 +40,11 @@ POINT_CHANNELS = 1  # reflectance
 
 
 class RefineOutputs(NamedTuple):
-    """What the second stage says of the proposals of B frames."""
+    """Outputs of the second stage for the proposals of B frames."""
 
     found: Refinements
     proposals: tuple[Detections, ...]
-    """Of each frame, which `found` is about."""
+    """Proposals of each frame, which `found` refines."""
 
 
 class RefineDetector(Trainable):
@@ -70,7 +70,7 @@ class RefineDetector(Trainable):
         return live_preparation(self.model)
 
     def predict(self, batch: LabeledProposals) -> RefineOutputs:
-        """Confidence and residuals of the proposals of a batch."""
+        """Return confidence and residuals of the proposals of a batch."""
         inputs = batch.inputs
         rows = min(len(inputs.points), len(inputs.keypoints), len(inputs.roi_features))
         if self.training and rows < 2:  # no statistics of a batch, and nothing to learn
@@ -80,7 +80,7 @@ class RefineDetector(Trainable):
         return RefineOutputs(found, batch.proposals)
 
     def loss(self, outputs: RefineOutputs, batch: LabeledProposals) -> Mapping[str, Tensor]:
-        """The terms by name, see `refine_loss`; proposals of IGNORED boxes take no part."""
+        """Return the terms by name, see `refine_loss`; proposals of IGNORED boxes are left out."""
         found, targets, learnt = outputs.found, batch.targets, batch.learnt
         counted = Refinements(found.confidence[learnt], found.residuals[learnt], found.keypoint_logits)
         wanted = RefineTargets(
@@ -93,12 +93,12 @@ class RefineDetector(Trainable):
         return refine_loss(counted, wanted)._asdict()
 
     def detect(self, outputs: RefineOutputs, spec: DetectorSpec) -> list[Detections]:
-        """Refined boxes of each frame, with the thresholds of `spec`."""
+        """Return refined boxes of each frame, with the thresholds of `spec`."""
         confidence, residuals = (part.float().cpu().numpy() for part in outputs.found[:2])
         return reported_frames(outputs.proposals, confidence, residuals, spec, self.model.refine.scores)
 
     def _zero_outputs(self, inputs: RefineInputs) -> Refinements:
-        """Zeros that every weight has a gradient of zero from, as training on several devices wants it."""
+        """Return zero outputs that give every weight a gradient of zero, as distributed training requires."""
         nothing = zero_of_weights(self)
         rois, keypoints = len(inputs.roi_features), len(inputs.keypoints)
         zeros = inputs.points.new_zeros
@@ -106,10 +106,10 @@ class RefineDetector(Trainable):
 
 
 def build_refine_detector(model: RefineModel) -> RefineDetector:
-    """The network that `model` describes, with fresh random weights.
+    """Build the network that `model` describes, with fresh random weights.
 
     Raises:
-        ConfigError: it does not say how many channels the first stage's map has.
+        ConfigError: it lacks the number of channels of the first stage's map.
     """
     if not model.bev_channels:
         raise ConfigError(
@@ -120,7 +120,7 @@ def build_refine_detector(model: RefineModel) -> RefineDetector:
 
 
 def build_refiner(bev_channels: int, classes: int, refine: RefineConfig) -> PillarRefiner:
-    """A second stage with fresh random weights."""
+    """Build a second stage with fresh random weights."""
     network, neighbors = refine.network, refine.neighbors
     return PillarRefiner(
         KeypointEncoder(
@@ -162,7 +162,7 @@ def refine(
 def refine_logits(
     network: PillarRefiner, points: NDArray[np.float32], proposed: Proposed, settings: RefineSettings
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Confidence logits (R,) and residuals (R, 7) of the proposals of one scan, see `refine`."""
+    """Return confidence logits (R,) and residuals (R, 7) of the proposals of one scan, see `refine`."""
     if not len(proposed.proposals):
         return np.empty(0, np.float32), np.empty((0, 7), np.float32)
     inputs = collate_scans([refine_scan(points, proposed, proposed.proposals, settings)])

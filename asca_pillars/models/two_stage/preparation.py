@@ -1,4 +1,4 @@
-"""Labelled frames to batches of the second stage."""
+"""Batches of the second stage from labelled frames."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -36,7 +36,7 @@ from asca_pillars.ops.two_stage.rois import (
 
 @dataclass(frozen=True)
 class RefineSample:
-    """One frame with the proposals that are learnt from, and what to say of them."""
+    """One frame with its sampled proposals and their targets."""
 
     scan: RefineScan
     targets: RoiTargets
@@ -59,7 +59,7 @@ def sample_of(
     rows: NDArray[np.int64],
     settings: RefineSettings,
 ) -> RefineSample:
-    """Neighbours and targets of the proposals `rows` (S,), which have these `overlaps` with the frame's boxes."""
+    """Return neighbors and targets of proposals `rows` (S,) with these `overlaps` with the frame's boxes."""
     chosen = proposed.proposals[rows]
     return RefineSample(
         scan=refine_scan(frame.points, proposed, chosen, settings),
@@ -70,7 +70,7 @@ def sample_of(
 
 
 def collate_samples(samples: Sequence[RefineSample]) -> RefineBatch:
-    """Samples of several frames, one frame's after the other's."""
+    """Concatenate the samples of several frames."""
     targets = [sample.targets for sample in samples]
     return RefineBatch(
         collate_scans([sample.scan for sample in samples]),
@@ -85,7 +85,7 @@ def collate_samples(samples: Sequence[RefineSample]) -> RefineBatch:
 
 
 def collate_scans(scans: Sequence[RefineScan]) -> RefineInputs:
-    """Scans of several frames, one frame's after the other's; indices then count through the batch."""
+    """Concatenate the scans of several frames; indices then count through the batch."""
     points = [len(scan.points) for scan in scans]
     keypoints = [len(scan.keypoints) for scan in scans]
     return RefineInputs(
@@ -100,7 +100,7 @@ def collate_scans(scans: Sequence[RefineScan]) -> RefineInputs:
 
 
 def _counted_through(frames: Sequence[tuple[NDArray[np.int32], ...]], rows: Sequence[int]) -> tuple[Tensor, ...]:
-    """Indices of each radius; those of a frame move by the rows of the frames before it, "nothing" to the very end."""
+    """Offset each radius's indices by the rows of the frames before; the index for empty entries moves to the end."""
     total, starts = sum(rows), np.cumsum([0, *rows[:-1]])
     return tuple(
         _joined(
@@ -122,7 +122,7 @@ class PreparedRefinement(NamedTuple):
 
     sample: RefineSample
     proposals: Detections
-    """Those of the sample, in its order."""
+    """Proposals of the sample, in its order."""
     learnt: NDArray[np.bool_]
     """(S,) those that the loss counts."""
 
@@ -135,19 +135,19 @@ class LabeledProposals(NamedTuple):
     learnt: Tensor
     """(R,) bool, the proposals that the loss counts."""
     proposals: tuple[Detections, ...]
-    """Of each frame."""
+    """Proposals of each frame."""
 
     def to(self, device: Any) -> "LabeledProposals":
-        """The same with its tensors on `device`."""
+        """Return the batch with its tensors on `device`."""
         moved: LabeledProposals = tree_map_only(Tensor, lambda tensor: tensor.to(device), self)
         return moved
 
 
 class ProposalSource(Protocol):
-    """Where a frame's proposals come from."""
+    """Source of a frame's proposals."""
 
     def __call__(self, frame: LabeledFrame) -> Proposed:
-        """What the first stage says of the frame as it is now."""
+        """Return the first-stage results of the frame in its current, perhaps augmented, state."""
         ...
 
 
@@ -164,7 +164,7 @@ class CachedProposals:
 
 @dataclass(frozen=True)
 class LiveProposals:
-    """Proposals of a first stage that is run; for whoever prepares in the process itself."""
+    """Proposals of a first stage that runs in this process."""
 
     stage: FirstStage
     settings: FirstStageSettings
@@ -182,7 +182,7 @@ class RefinePreparation:
     source: ProposalSource
 
     def prepare(self, frame: LabeledFrame, rng: np.random.Generator | None) -> PreparedRefinement:
-        """Neighbours and targets of proposals: drawn ones for training, without `rng` all of them."""
+        """Return neighbors and targets of proposals: sampled ones for training, all of them without `rng`."""
         points = frame.points[np.isfinite(frame.points).all(axis=1)]
         frame = replace(frame, points=points)
         proposed = self.source(frame)
@@ -193,14 +193,14 @@ class RefinePreparation:
         return PreparedRefinement(sample, proposed.proposals[rows], ~overlaps.ignored[rows])
 
     def collate(self, frames: Sequence[PreparedRefinement]) -> LabeledProposals:
-        """Frames as one batch."""
+        """Collate frames into one batch."""
         batch = collate_samples([frame.sample for frame in frames])
         learnt = torch.from_numpy(np.concatenate([frame.learnt for frame in frames]))
         return LabeledProposals(*batch, learnt, tuple(frame.proposals for frame in frames))
 
 
 def cached_preparation(model: RefineModel, split: LabeledSplit, data: DataConfig) -> RefinePreparation:
-    """For the frames of `split`, whose proposals are computed where they are not yet on disk.
+    """Return the preparation for the frames of `split`; proposals that are not on disk yet are computed.
 
     Raises:
         AscaError: the first stage cannot be opened, a frame not be read, or a file not be written.
@@ -215,7 +215,7 @@ def cached_preparation(model: RefineModel, split: LabeledSplit, data: DataConfig
 
 
 def live_preparation(model: RefineModel) -> RefinePreparation:
-    """For scans of which nothing is on disk: the first stage runs on each.
+    """Return the preparation for single scans: the first stage runs on each of them.
 
     Raises:
         AscaError: the first stage cannot be opened, or is not the one of the training.
@@ -225,7 +225,7 @@ def live_preparation(model: RefineModel) -> RefinePreparation:
 
 
 def move_proposed(proposed: Proposed, motion: Motion) -> Proposed:
-    """Proposals and keypoints in the scene that moved; what the map says of a keypoint stays."""
+    """Move proposals and keypoints with the augmented scene; map features of keypoints stay."""
     proposals = proposed.proposals
     moved = LabeledFrame("", proposed.keypoints.copy(), proposals.boxes.copy(), proposals.labels)
     move_scene(moved, motion)

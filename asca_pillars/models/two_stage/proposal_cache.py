@@ -19,7 +19,7 @@ from asca_pillars.data.labeled_split import LabeledSplit
 from asca_pillars.detection.detections import Detections
 from asca_pillars.ops.two_stage.first_stage import FirstStage, FirstStageSettings, Proposed, propose_on
 
-_FORMAT = 3  # of the files; another number lets old ones lie
+_FORMAT = 3  # format of the files; with another number, old ones are not read
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class ProposalFiles:
     class_names: tuple[str, ...]
 
     def read(self, frame_id: str) -> Proposed:
-        """What the first stage says of a frame.
+        """Read the first-stage results of a frame.
 
         Raises:
             DatasetError: its file is missing or damaged.
@@ -47,14 +47,14 @@ class ProposalFiles:
             raise DatasetError(f"{path}: damaged ({error}); delete it, it will be computed again") from None
 
     def path(self, frame_id: str) -> Path:
-        """The frame's file."""
+        """Return the path of the frame's file."""
         return self.folder / f"{frame_id}.npz"
 
 
 class ProposalCache:
     """Files below `prepared`/proposals-KEY, one for each frame; KEY names the first stage and the settings.
 
-    Each file tells what its frame's points depended on (`points_state`), so that a frame that changed is noticed.
+    Each file records the state of its frame's points (`points_state`), so that changed frames are detected.
 
     Args:
         prepared: folder of what is computed once per dataset, see `data.insertion.prepared`.
@@ -73,7 +73,7 @@ class ProposalCache:
         self.files = ProposalFiles(prepared / pool / f"proposals-{key}", stage.spec.class_names)
 
     def fill(self, split: LabeledSplit, *, workers: int = 1, console: Console | None = None) -> None:
-        """Compute what is missing or outdated. Each file appears when it is complete, so a killed run just goes on.
+        """Compute what is missing or outdated. Each file appears when it is complete, so a killed run can be resumed.
 
         Args:
             split: frames.
@@ -91,7 +91,7 @@ class ProposalCache:
             pass
 
     def _is_current(self, split: LabeledSplit, frame_id: str) -> bool:
-        """Whether the frame's file was made from its scan as it is; of the file only the stamp is read."""
+        """Return whether the frame's file was made from its scan as it is; only the file's stamp is read."""
         try:
             with self.files.path(frame_id).open("rb") as file, np.load(file, allow_pickle=False) as arrays:
                 return np.array_equal(arrays["stamp"], _stamp(split, frame_id))
@@ -115,7 +115,7 @@ def _propose(
 
 
 def _stamp(split: LabeledSplit, frame_id: str) -> NDArray[np.int64]:
-    """What tells that the files which the proposals were made from are still the same; empty if one is gone."""
+    """Return the state of the files that the proposals were made from; empty if one is missing."""
     try:
         return np.array(split.points_state(frame_id))
     except FileNotFoundError:  # reported, in words, by whoever reads it

@@ -12,7 +12,7 @@ NORM_EPS, NORM_MOMENTUM = 1e-5, 0.1  # PV-RCNN's of point features: torch's own
 
 
 def mlp(in_channels: int, widths: Sequence[int], dropout: float = 0.0) -> list[nn.Module]:
-    """Linear, BatchNorm, ReLU for each width; dropout between them."""
+    """Build Linear, BatchNorm, ReLU for each width; dropout between them."""
     layers: list[nn.Module] = []
     for width in widths:
         if layers and dropout:
@@ -30,8 +30,8 @@ class SetAbstraction(nn.Module):
     """MLP(3 + C -> widths) on [p_j - q ; f_j] for the points j of the ball around q, then the maximum.
 
     The first layer is linear, so W [p_j - q ; f_j] = W [p_j ; f_j] - W [q ; 0]: once for each point and once for each
-    query instead of once for each pair, exact but for rounding. It must stay in float32, because p_j and q are large
-    and their difference is small.
+    query instead of once for each pair, exact up to rounding. It must stay in float32, because p_j and q are large and
+    their difference is small.
 
     Args:
         in_channels: C, features of a point; may be 0.
@@ -46,11 +46,11 @@ class SetAbstraction(nn.Module):
         self.out_channels = widths[-1]
 
     def forward(self, positions: Tensor, features: Tensor, queries: Tensor, indices: Tensor) -> Tensor:
-        """Features of the queries, (Q, out_channels), see `grouped`."""
+        """Return features of the queries, (Q, out_channels), see `grouped`."""
         return self.grouped(positions, features, queries, indices).max(dim=1).values
 
     def grouped(self, positions: Tensor, features: Tensor, queries: Tensor, indices: Tensor) -> Tensor:
-        """Output of the MLP for each point of each ball, (Q, T, out_channels).
+        """Return the output of the MLP for each point of each ball, (Q, T, out_channels).
 
         Args:
             positions: (N, 3) of the points, metres, in the frame of the queries.
@@ -68,7 +68,7 @@ class SetAbstraction(nn.Module):
         return self.after_first(grouped.flatten(0, 1)).unflatten(0, indices.shape)
 
     def after_first(self, pairs: Tensor) -> Tensor:
-        """Outputs of the first layer -> those of the last one, both (Q * T, channels)."""
+        """Apply the layers after the first: (Q * T, channels) -> (Q * T, channels)."""
         pairs = torch.relu(self.norms[0](pairs))
         for layer, norm in zip(self.layers[1:], self.norms[1:], strict=True):
             pairs = torch.relu(norm(layer(pairs)))
@@ -76,13 +76,13 @@ class SetAbstraction(nn.Module):
 
 
 def first_occurrences(indices: Tensor, count: int) -> Tensor:
-    """(Q, T) 1 for what `ball_query` found, 0 where it repeats a ball's first member, and for index `count`."""
+    """Return (Q, T) 1 for points that `ball_query` found, 0 for repetitions of the first one and for index `count`."""
     again = (indices[:, 1:] != indices[:, :1]) & (indices[:, 1:] < count)
     return torch.cat([indices[:, :1] < count, again], dim=1).float()
 
 
 _NEAREST = 3
-_LEAST_DISTANCE_M = 1e-8  # of a point that stands where a cell's center is
+_LEAST_DISTANCE_M = 1e-8  # lower bound, for a point at a cell's center
 
 
 class VectorPool(nn.Module):
@@ -116,7 +116,7 @@ class VectorPool(nn.Module):
         self.out_channels = widths[-1]
 
     def forward(self, positions: Tensor, features: Tensor, queries: Tensor, indices: Tensor) -> Tensor:
-        """Features of the queries, (Q, out_channels).
+        """Return features of the queries, (Q, out_channels).
 
         Args:
             positions: (N, 3) of the points, metres, in the frame of the queries.
@@ -136,7 +136,7 @@ class VectorPool(nn.Module):
 
     @staticmethod
     def _cell(place: Tensor, of_points: Tensor, padded: Tensor, centers: Tensor, index: Tensor) -> Tensor:
-        """[a_i - v_t ; h_t] W_t of one cell, (Q, cell_channels)."""
+        """Return [a_i - v_t ; h_t] W_t of one cell, (Q, cell_channels)."""
         found = (index < padded.shape[0] - 1).to(padded.dtype)  # (Q, 3)
         near = padded.index_select(0, index.reshape(-1)).unflatten(0, index.shape)
         away = (near - centers[:, None]) * found[..., None]  # a_i - v_t

@@ -31,7 +31,7 @@ _MOST_PILLARS = 1 << 17  # along one axis
 
 
 class GridTables(NamedTuple):
-    """What turns a point into a cell: the x range in slices of the finest depth, whose borders include every column's.
+    """Lookup tables from points to cells: x in slices of the finest depth, whose borders include every column's.
 
     Borders are float32, as the points are.
     """
@@ -67,8 +67,8 @@ class PillarGrid(Strict):
     zones: int = 3
     """K, the number of pillar depths."""
     map: Literal["warped", "pooled"] = "warped"
-    """What the neck reads. `warped`: a column for every pillar along x, as the paper prints it. `pooled`: columns as
-    deep as the second zone's pillars everywhere, see `map_pooling`. With one zone both are the same."""
+    """Map that the neck reads. `warped`: a column for every pillar along x, as the paper prints it. `pooled`: columns
+    as deep as the second zone's pillars everywhere, see `map_pooling`. With one zone both are the same."""
 
     def __post_init__(self) -> None:
         for name in ("x_range_m", "y_range_m", "z_range_m"):
@@ -110,7 +110,7 @@ class PillarGrid(Strict):
 
     @property
     def ranges(self) -> Ranges:
-        """The three ranges, for what needs no pillars."""
+        """Detection ranges along x, y, z."""
         return Ranges(self.x_range_m, self.y_range_m, self.z_range_m)
 
     @property
@@ -121,7 +121,7 @@ class PillarGrid(Strict):
 
     @property
     def pools(self) -> bool:
-        """Whether the map is another one than the pillars' own."""
+        """True if the map differs from the grid of pillars."""
         return self.map == "pooled" and self.zones > 1
 
     @cached_property
@@ -131,7 +131,7 @@ class PillarGrid(Strict):
 
     @cached_property
     def map_columns(self) -> NDArray[np.int64]:
-        """First column of the pooled map that each column of pillars stands in, (nx,)."""
+        """First column of the pooled map that each column of pillars covers, (nx,)."""
         per_zone = 2 * self._first_zone_columns
         zones = [
             zone * per_zone + (np.arange(self._first_zone_columns << zone) * 2 >> zone) for zone in range(self.zones)
@@ -140,7 +140,7 @@ class PillarGrid(Strict):
 
     @cached_property
     def map_copies(self) -> NDArray[np.int64]:
-        """In how many columns of the pooled map each column of pillars stands, (nx,)."""
+        """Number of columns of the pooled map that each column of pillars covers, (nx,)."""
         return np.where(np.arange(self.nx) < self._first_zone_columns, 2, 1)
 
     @cached_property
@@ -154,7 +154,7 @@ class PillarGrid(Strict):
         return _read_only(np.linspace(*self.y_range_m, self.ny + 1))
 
     def cells(self, points: NDArray[np.floating[Any]]) -> NDArray[np.int64]:
-        """Flat pillar index row * nx + column of each point, or -1 outside the ranges.
+        """Return the flat pillar index row * nx + column of each point, or -1 outside the ranges.
 
         Borders belong to the pillar above them: a point on a range's lower end is inside, on its upper end
         outside. Points and borders are compared as float32, so that a point written as -39.68 stands on a
@@ -180,12 +180,12 @@ class PillarGrid(Strict):
         return cells
 
     def cell_centers_m(self, cells: NDArray[np.int64]) -> NDArray[np.float32]:
-        """Centers x, y of the pillars with these flat indices: (n,) -> (n, 2) float32, metres."""
+        """Return the centers x, y of the pillars with these flat indices: (n,) -> (n, 2) float32, metres."""
         rows, columns = np.divmod(cells, self.nx)
         return np.stack([self.column_centers_m[columns], self.row_centers_m[rows]], axis=-1)
 
     def head_centers_m(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Centers of the head map's cells, metres, LiDAR frame: x of its columns (W,), y of its rows (H,).
+        """Return centers of the head map's cells, metres, LiDAR frame: x of its columns (W,), y of its rows (H,).
 
         Zones hold a multiple of HEAD_STRIDE columns, so the two columns of a head cell are equally deep.
         """
@@ -233,7 +233,7 @@ class PillarGrid(Strict):
 
 
 def _interval(values: NDArray[np.float32], edges: NDArray[np.float32]) -> NDArray[np.int64]:
-    """Index of the interval [edges[i], edges[i + 1]) around each value, for evenly spaced edges.
+    """Return the index of the interval [edges[i], edges[i + 1]) around each value, for evenly spaced edges.
 
     Equal to np.searchsorted(edges, values, "right") - 1 and several times faster on unsorted values.
     """
@@ -266,7 +266,7 @@ class MapCells(NamedTuple, Generic[Array]):
 
 
 def map_cells(cells: NDArray[np.int64], grid: PillarGrid) -> MapCells[NDArray[np.int64]] | None:
-    """Where pillars at these cells (P,) of the grid, ascending, stand on the map; None where both are the same."""
+    """Return the map cells of pillars at ascending grid cells (P,); None where map and grid are the same."""
     if not grid.pools:
         return None
     rows, columns = np.divmod(cells, grid.nx)
@@ -283,7 +283,7 @@ def map_cells(cells: NDArray[np.int64], grid: PillarGrid) -> MapCells[NDArray[np
 def pool_pillars(
     features: NDArray[Value], cells: NDArray[np.int64], grid: PillarGrid
 ) -> tuple[NDArray[Value], NDArray[np.int64]]:
-    """Features (P, C) of pillars at cells (P,) of the grid -> (M, C) and (M,) of the map.
+    """Pool features (P, C) of pillars at cells (P,) of the grid -> (M, C) and (M,) of the map.
 
     Steps of a quantized graph may be pooled as well: their order is that of the values.
     """
@@ -308,7 +308,7 @@ _PILLAR_TOLERANCE = 1e-3
 
 
 def fits(span_m: tuple[float, float], pillar_m: float, zones: int = 1) -> bool:
-    """Whether each of `zones` equal parts of a range is a multiple of NECK_STRIDE of the first one's pillars.
+    """Return whether each of `zones` equal parts of a range is a multiple of NECK_STRIDE of the first one's pillars.
 
     Columns double from zone to zone, so the map has an odd multiple (2^K - 1) of the first zone's columns,
     and the neck's stride must divide these. Then every zone also holds a multiple of HEAD_STRIDE columns,
@@ -320,7 +320,7 @@ def fits(span_m: tuple[float, float], pillar_m: float, zones: int = 1) -> bool:
 
 
 def x_advice(span_m: tuple[float, float], v_max_m: float, zones: int) -> str:
-    """Why an x range does not fit, and the nearest ranges, pillar depth and numbers of zones that do."""
+    """Explain why an x range does not fit, with the nearest ranges, pillar depth and numbers of zones that do."""
     step_m = NECK_STRIDE * zones * v_max_m
     advice = f"x_range_m {_nearest_ranges(span_m, step_m)}, or v_max_m {_nearest_size(span_m, v_max_m, zones)}"
     working = [str(k) for k in range(1, MAX_ZONES + 1) if fits(span_m, v_max_m, k)]
@@ -333,7 +333,7 @@ def x_advice(span_m: tuple[float, float], v_max_m: float, zones: int) -> str:
 
 
 def y_advice(span_m: tuple[float, float], v_y_m: float) -> str:
-    """Why a y range does not fit, and the nearest ranges and pillar width that do."""
+    """Explain why a y range does not fit, with the nearest ranges and pillar width that do."""
     step_m = NECK_STRIDE * v_y_m
     return (
         f"y_range_m {_show(span_m)} must be a multiple of {step_m:.7g} m "
@@ -343,7 +343,7 @@ def y_advice(span_m: tuple[float, float], v_y_m: float) -> str:
 
 
 def _nearest_ranges(span_m: tuple[float, float], step_m: float) -> str:
-    """The next shorter and longer range: about the origin if `span_m` is, else from the same minimum."""
+    """Return the next shorter and longer range: about the origin if `span_m` is, else from the same minimum."""
     low, high = span_m
     steps = math.floor((high - low) / step_m)
     ranges = []

@@ -1,6 +1,6 @@
-"""The loops of `pillarize`, compiled; tests/ops/numpy_kernels.py has them in NumPy.
+"""Compiled loops of `pillarize`; tests/ops/numpy_kernels.py has them in NumPy.
 
-Indices are unsigned where it matters: with others, numba looks for negative ones, which count from the end.
+Indices are unsigned where it matters: for signed ones, numba checks for negative values, which count from the end.
 """
 
 from typing import Any
@@ -21,7 +21,7 @@ _BLOCK = 16  # cells of the grid that are looked at together
 
 
 def sort_points(points: _Floats, grid: PillarGrid) -> tuple[_Counts, _Integers, _Integers]:
-    """`numpy_kernels._sort_points`, by counting: (N, 4) -> indices (K,) of the points inside, cells, counts (Q,)."""
+    """Compute `numpy_kernels._sort_points` by counting: (N, 4) -> indices (K,) of points inside, cells, counts (Q,)."""
     size = -(-grid.ny * grid.nx // _BLOCK) * _BLOCK
     # In one piece: glibc gives several pieces back to the system, and gets them page by page again for the next scan.
     memory = np.empty(5 * len(points) + size, np.uint32)
@@ -33,7 +33,7 @@ def sort_points(points: _Floats, grid: PillarGrid) -> tuple[_Counts, _Integers, 
 
 @inner
 def _interval(value: float, edges: _Floats, per_m: float) -> Any:
-    """`grid._interval` of one value."""
+    """Compute `grid._interval` of one value."""
     guess = np.uint64(min(int((value - edges[0]) * per_m), len(edges) - 2))
     if value < edges[guess]:
         return guess - np.uint64(1)
@@ -86,7 +86,7 @@ def _sort_points(
         occupied = 0
         for cell in range(block, block + _BLOCK):
             occupied |= tally[cell]
-        if not occupied:  # as most of them are, and looking at a block at once costs little
+        if not occupied:  # most blocks are empty, and a block is tested at once
             continue
         for cell in range(block, block + _BLOCK):
             count = tally[cell]
@@ -112,7 +112,7 @@ def fill_pillars(
     max_points: int,
     grid: PillarGrid,
 ) -> tuple[_Floats, _Integers, _Integers]:
-    """`numpy_kernels._fill_pillars`, in one pass: features (M, 9), pillar indices (M,) and counts of points (P,)."""
+    """Compute `numpy_kernels._fill_pillars`, in one pass: features (M, 9), pillar indices (M,), point counts (P,)."""
     point_counts = np.minimum(counts[kept], max_points)
     features = np.empty((point_counts.sum(), 9), np.float32)
     pillar_index = np.empty(len(features), np.int64)

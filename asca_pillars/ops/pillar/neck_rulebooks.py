@@ -3,7 +3,7 @@
 The neck is that of Table 1 (three blocks that halve the map, three upsamplings to the head's resolution), computed at
 active cells alone. Which cells are active is a rule:
 
-- `sub`: strided convolutions reach every output that sees an active input, all others stay where their input is;
+- `sub`: strided convolutions are regular (every output with an active input), all others are submanifold;
 - `fine`: as `sub`, and the first stride-1 convolution of the finest block also writes to the eight neighbors of its
   active cells. The coarser levels follow from the cells before that growth.
 
@@ -52,10 +52,10 @@ class LevelRulebooks(NamedTuple, Generic[Array]):
 
 
 class NeckRulebooks(NamedTuple, Generic[Array]):
-    """Of one scan (NumPy), or of a batch (tensors), whose rows follow one another frame by frame."""
+    """Rulebooks of the neck for one scan (NumPy), or for a batch (tensors), whose rows follow frame by frame."""
 
     levels: tuple[LevelRulebooks[Array], ...]
-    """From the finest to the coarsest."""
+    """Levels from the finest to the coarsest."""
     head_cells: Array
     """(H,) flat index of the active cells on the head's map, of a batch counted through the maps of its frames."""
     frame_rows: tuple[int, ...]
@@ -65,7 +65,7 @@ class NeckRulebooks(NamedTuple, Generic[Array]):
 
 
 class NeckRulebookBuilder:
-    """Builds the rulebooks of scan after scan, in memory of its own: for one thread at a time.
+    """Builder of a neck's rulebooks, which reuses its memory: for one thread at a time.
 
     Args:
         ny, nx: pillars of the map, multiples of 8.
@@ -92,7 +92,7 @@ class NeckRulebookBuilder:
         ]
 
     def build(self, cells: NDArray[np.int64]) -> NeckRulebooks[NDArray[np.int32]]:
-        """Rulebooks of a scan with pillars at these cells (P,): flat indices row * nx + column, ascending."""
+        """Build the rulebooks of a scan with pillars at these cells (P,): flat indices row * nx + column, ascending."""
         self._activate(cells)
         levels = []
         for number in range(LEVELS):
@@ -118,7 +118,7 @@ class NeckRulebookBuilder:
         return NeckRulebooks(tuple(levels), self._head.cells.astype(np.int32), (len(self._head),), self._head.shape[1:])
 
     def _activate(self, cells: NDArray[np.int64]) -> None:
-        """Find the active cells of every map, as the rule says."""
+        """Activate the cells of every map according to the rule."""
         self._pillars.activate(cells)
         before = self._pillars
         for strided_map, level in zip(self._strided_maps, self._strided, strict=True):
@@ -133,7 +133,7 @@ class NeckRulebookBuilder:
 def stack_neck_rulebooks(
     frames: Sequence[NeckRulebooks[NDArray[np.int32]]], pillars: Sequence[int]
 ) -> NeckRulebooks[NDArray[np.int32]]:
-    """Rulebooks of a batch from those of its frames.
+    """Stack the rulebooks of frames into those of a batch.
 
     Args:
         frames: at least one, all of one map; indices (M, 9) or (M,).
@@ -167,7 +167,7 @@ def stack_neck_rulebooks(
 
 
 def rulebook_inputs(tables: NeckRulebooks[Array]) -> dict[str, Array]:
-    """What a graph of the neck can ask for, by the names of its inputs; it takes what its layers read."""
+    """Return the rulebooks by the names of a neck graph's inputs; a graph takes those that its layers read."""
     return {
         f"{kind}_{number}": getattr(level, kind)
         for number, level in enumerate(tables.levels)

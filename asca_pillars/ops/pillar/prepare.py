@@ -1,7 +1,7 @@
-"""Points -> pillars: the network's input (paper section 3.2), in training, export and on the vehicle.
+"""Pillarization: the network's input from points (paper section 3.2), for training, export and runtime.
 
-Pillars are flat: the kept points of all pillars stand one after another, and `pillar_index` says whose each
-is. Nothing is padded, so nothing needs to be masked later.
+Pillars are flat: the kept points of all pillars follow one another, and `pillar_index` holds the pillar of each point.
+There is no padding, and no masking later.
 """
 
 import reprlib
@@ -40,7 +40,7 @@ class PillarLimits(Strict):
 
 @dataclass(frozen=True)
 class PillarCounts(ScanCounts):
-    """What became of a scan's points on the grid; points that are not finite count as outside."""
+    """Counts of a scan's points on the grid; points that are not finite count as outside."""
 
     pillars: int
     """Pillars kept."""
@@ -104,10 +104,10 @@ def pillarize(
 
 
 def evenly(places: NDArray[np.int64], counts: NDArray[np.int64] | int, most: int) -> NDArray[np.bool_]:
-    """Whether what stands at these places, from 0, of rows of these counts stays, if `most` of a row may.
+    """Return a mask of the entries kept if a row may keep `most`: positions in the rows, from 0, and the rows' lengths.
 
-    What stays are even steps along the row: the share that random sampling would keep (paper section 3.2), of every
-    part of the row alike, and a scan always gives the same.
+    Kept entries are evenly spaced along the row: the share that random sampling keeps (paper section 3.2), taken from
+    every part of the row alike and without randomness.
     """
     stay = np.minimum(most, counts)
     return (places + 1) * stay // counts > places * stay // counts

@@ -1,4 +1,4 @@
-"""One pillar detector's numbers, all that training and the vehicle must agree on. `bundle.json` carries it."""
+"""Spec of a pillar detector, shared by training, export and runtime; stored in `bundle.json`."""
 
 from dataclasses import dataclass, field
 from typing import Literal
@@ -32,15 +32,15 @@ class PillarSpec(DetectorSpec):
 
     @property
     def ranges(self) -> Ranges:
-        """Where objects are looked for."""
+        """Detection ranges."""
         return self.grid.ranges
 
     def head_centers_m(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Centers of the head map's cells in metres, LiDAR frame: x of its columns (W,), y of its rows (H,)."""
+        """Return centers of the head map's cells in metres, LiDAR frame: x of its columns (W,), y of its rows (H,)."""
         return self.grid.head_centers_m()
 
     def anchor_centers_m(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Where anchors stand: x of the head map's columns (W,), y of its rows (H,), metres, LiDAR frame."""
+        """Return anchor centers in metres, LiDAR frame: x of the head map's columns (W,), y of its rows (H,)."""
         if self.anchor_places == "cells":
             return self.head_centers_m()
         rows, columns = self.grid.head_shape
@@ -48,9 +48,9 @@ class PillarSpec(DetectorSpec):
 
     @property
     def scores_per_anchor(self) -> int:
-        """How many scores each anchor has."""
+        """Number of scores of each anchor."""
         return len(self.classes) if self.anchor_scores == "every" else 1
 
     def pillarize(self, points: NDArray[np.float32]) -> Pillars:
-        """Pillars of a scan (N, 4) in the LiDAR frame on this detector's grid, see `pillarize`."""
+        """Return pillars of a scan (N, 4) in the LiDAR frame on this detector's grid, see `pillarize`."""
         return pillarize(points, self.grid, self.limits)

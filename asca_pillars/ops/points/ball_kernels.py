@@ -1,4 +1,4 @@
-"""The loops of `ball_query` and `cube_neighbors`, compiled; tests/ops/numpy_kernels.py has them in NumPy."""
+"""Compiled loops of `ball_query` and `cube_neighbors`; tests/ops/numpy_kernels.py has them in NumPy."""
 
 from typing import Any, TypeAlias
 
@@ -28,7 +28,7 @@ def ball_query(
     samples: int,
     share: int,
 ) -> _Integers:
-    """`numpy_kernels._ball_query`, query by query: metres (N, 3), (Q, 3) -> indices (Q, samples)."""
+    """Compute `numpy_kernels._ball_query`, query by query: metres (N, 3), (Q, 3) -> indices (Q, samples)."""
     found, sorted_xyz = np.empty((len(centers), samples), np.int32), np.empty((len(xyz), 3), np.float32)
     at = centers, cells_of(centers, columns)
     widths = np.zeros(2 * int(offsets.max()) + 1, np.int32)
@@ -39,7 +39,7 @@ def ball_query(
 
 
 def three_nearest(xyz: _Floats, centers: _Floats, columns: Columns) -> tuple[_Integers, _Floats]:
-    """`numpy_kernels._three_nearest`, in rings of columns around each query.
+    """Compute `numpy_kernels._three_nearest`, in rings of columns around each query.
 
     Metres (N, 3), (Q, 3) -> indices (Q, 3) and squared distances (Q, 3) in m²; N and infinity where there is no point.
     """
@@ -60,7 +60,7 @@ def nearest_in_cubes(
     offsets: _Floats,
     reach_m: np.float32,
 ) -> _Integers:
-    """`numpy_kernels._nearest_in_cubes`, in columns (Q, 2) `first` to `last`: metres (N, 3), (Q, 3) -> (Q, T, 3)."""
+    """Compute `numpy_kernels._nearest_in_cubes` in columns `first` to `last` (Q, 2): (N, 3), (Q, 3) -> (Q, T, 3)."""
     nearest = np.empty((len(centers), len(offsets), 3), np.int32)
     at = centers, first, last
     room = np.empty(len(xyz), np.int32)
@@ -95,7 +95,7 @@ def _ball_query(
     sorted_xyz: _Floats,
     found: _Integers,
 ) -> None:
-    """`widths`: of each row of `offsets`, how many columns a ball can reach to either side."""
+    """Kernel of `ball_query`; `widths`: for each row of `offsets`, how many columns a ball reaches to either side."""
     for k in range(len(order)):
         for axis in range(3):
             sorted_xyz[k, axis] = xyz[order[k], axis]
@@ -157,7 +157,7 @@ def _ball_query(
 
 @inner
 def _kept(i: int, distance: float, nearest: _Three, squared: _Three) -> tuple[_Three, _Three]:
-    """The three nearest with one more point, of equally near ones the earlier first."""
+    """Merge a point into the three nearest; of equally near ones the earlier comes first."""
     i0, i1, i2 = nearest
     d0, d1, d2 = squared
     if distance > d2 or (distance == d2 and i > i2):
@@ -191,7 +191,7 @@ def _three_nearest(
         row, column = min(max(cells[query, 0], 0), ny - 1), min(max(cells[query, 1], 0), nx - 1)
         found, away = (none, none, none), (infinity, infinity, infinity)
         for ring in range(max(nx, ny)):
-            # What lies outside `ring - 1` rings is that many columns away, but for rounding.
+            # Points outside `ring - 1` rings are at least that many columns away, within rounding.
             clear = max(ring - np.float32(1.01), np.float32(0)) / per_m
             if away[2] < clear * clear:
                 break

@@ -1,4 +1,4 @@
-"""Balls as a graph reads them faster than `ball_query`'s indices: their points gathered, or balls of like size grouped.
+"""Layouts of balls that graphs read faster than `ball_query`'s indices: gathered points, or groups of like size.
 
 A row of `ball_query` repeats its first point where the ball holds fewer. The maximum over a ball is the same without
 the repetitions; on the grids of proposals most of what the rows hold are repetitions.
@@ -9,16 +9,16 @@ from typing import Generic, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-_EIGHTHS = (1, 2, 4, 6, 8)  # of the samples: one more width would save less than its operators cost
+_EIGHTHS = (1, 2, 4, 6, 8)  # widths as shares of the samples: one more would save less than its operators cost
 
 Indices = TypeVar("Indices")
 
 
 class BallGroup(NamedTuple, Generic[Indices]):
-    """Balls of about as many points."""
+    """Group of balls with about as many points."""
 
     queries: Indices
-    """(n,) which query each ball is around; Q of an empty ball."""
+    """(n,) query of each ball; Q for an empty ball."""
     members: Indices
     """(n, width) points of each ball, each of them at least once; N stands for nothing."""
 
@@ -27,18 +27,18 @@ class GroupedBalls(NamedTuple, Generic[Indices]):
     """The balls of Q queries."""
 
     groups: tuple[BallGroup[Indices], ...]
-    """One for each of `group_widths`, perhaps empty."""
+    """One group for each of `group_widths`, perhaps empty."""
     rows: Indices
-    """(Q,) where the ball of each query stands among those of the groups, one group after the other."""
+    """(Q,) position of each query's ball in the concatenated groups."""
 
 
 def group_widths(samples: int) -> tuple[int, ...]:
-    """Columns of `members` in each group, ascending, for balls of up to `samples` points."""
+    """Return the widths of `members` in each group, ascending, for balls of up to `samples` points."""
     return tuple(sorted({-(-samples * eighths // 8) for eighths in _EIGHTHS}))
 
 
 def group_balls(indices: NDArray[np.int32], count: int) -> GroupedBalls[NDArray[np.int32]]:
-    """Each ball in the narrowest group that has room for its points.
+    """Assign each ball to the narrowest group that has room for its points.
 
     Args:
         indices: (Q, samples), what `ball_query` found.
@@ -65,7 +65,7 @@ def group_balls(indices: NDArray[np.int32], count: int) -> GroupedBalls[NDArray[
 def gather_balls(
     points: NDArray[np.float32], centers: NDArray[np.float32], indices: NDArray[np.int32]
 ) -> NDArray[np.float32]:
-    """The points of each ball, their positions relative to its center; zeros for nothing.
+    """Gather the points of each ball, their positions relative to its center; zeros for empty entries.
 
     Args:
         points: (N, 3 + C), x, y, z first.

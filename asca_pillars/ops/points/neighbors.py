@@ -1,6 +1,6 @@
 """Neighbors of queries: in balls (PointNet++), the nearest three, in cells of cubes (VectorPool), at several scales.
 
-Index N, one past the last point, stands for nothing: whoever gathers rows appends a row of zeros.
+Index N, one past the last point, stands for nothing: callers append a row of zeros before gathering.
 """
 
 import math
@@ -23,9 +23,9 @@ _ROUNDING = 1e-3  # of a column: how far float32 may misplace a point that stand
 
 
 def ball_query(points: NDArray[Any], queries: NDArray[Any], radius_m: float, samples: int) -> NDArray[np.int32]:
-    """For each query the indices of up to `samples` points nearer than the radius: (N, 3), (Q, 3) -> (Q, samples).
+    """Return up to `samples` indices of points within the radius of each query: (N, 3), (Q, 3) -> (Q, samples).
 
-    A ball of fewer points has them as they are stored, then its first one again and again; one without any has N.
+    A ball of fewer points holds them in the order of storage, then repeats its first one; an empty ball holds N.
 
     The columns of a full ball are visited in a pseudo-random order that depends on their number alone, the points of a
     column as they are stored, and the first `samples` found are taken: at first no more than an eighth of them from one
@@ -49,7 +49,7 @@ def ball_query(points: NDArray[Any], queries: NDArray[Any], radius_m: float, sam
 
 
 def three_nearest(points: NDArray[Any], queries: NDArray[Any]) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
-    """The three points nearest to each query and their weights: (N, 3), (Q, 3) -> (Q, 3) indices, (Q, 3) weights.
+    """Return three nearest points of each query, and weights: (N, 3), (Q, 3) -> (Q, 3) indices, (Q, 3) weights.
 
     Weights are inverse distances that sum to 1 (PointNet++, section 3.4). Nearest first, of equally near ones the
     earlier; with fewer than three points the rest is index N with weight 0.
@@ -68,7 +68,7 @@ def three_nearest(points: NDArray[Any], queries: NDArray[Any]) -> tuple[NDArray[
 
 @lru_cache(maxsize=64)  # the radius in columns follows the scan where that is wide
 def _visiting_order(radius: float) -> NDArray[np.int32]:
-    """(row, column) offsets (M, 2) of the columns that a ball of so many columns' radius can reach, shuffled."""
+    """Return shuffled (row, column) offsets (M, 2) of the columns that a ball can reach; the radius is in columns."""
     reach = math.ceil(radius + _ROUNDING)
     offsets = np.indices((2 * reach + 1, 2 * reach + 1)).reshape(2, -1).T - reach
     gap = np.maximum(np.abs(offsets) - 1 - _ROUNDING, 0)
@@ -89,7 +89,7 @@ _CUBE_ROUNDING = 1e-2  # of a column: how far float32 may misplace a point that 
 
 
 def cube_cells_m(half_length_m: float, cells: int) -> NDArray[np.float32]:
-    """Centers of the cells of a cube, seen from its own: (cells^3, 3) metres; z varies fastest, x slowest."""
+    """Return centers of the cells of a cube, relative to its own: (cells^3, 3) metres; z varies fastest, x slowest."""
     share = (np.indices((cells, cells, cells)).reshape(3, -1).T + 0.5) * (2 / cells) - 1
     return np.ascontiguousarray(half_length_m * share, np.float32)
 
@@ -97,10 +97,10 @@ def cube_cells_m(half_length_m: float, cells: int) -> NDArray[np.float32]:
 def nearest_in_cubes(
     points: NDArray[Any], queries: NDArray[Any], half_length_m: float, cells: int
 ) -> NDArray[np.int32]:
-    """The three points nearest to each cell of a cube around each query: (N, 3), (Q, 3) -> (Q, cells^3, 3) indices.
+    """Return three nearest points of each cell of a cube around each query: (N, 3), (Q, 3) -> (Q, cells^3, 3) indices.
 
-    Points count that are less than twice the half length away from the query along every axis (VectorPool; AV PV-RCNN,
-    eq. 12 and 13). Nearest first, of equally near ones the earlier; with fewer than three points the rest is index N.
+    Only points within twice the half length of the query along every axis count (VectorPool; AV PV-RCNN, eq. 12 and
+    13). Nearest first, of equally near ones the earlier; with fewer than three points the rest is index N.
 
     Args:
         points: (N, >=3) finite x, y, z in metres; N may be 0.
@@ -136,20 +136,21 @@ class PointScale(NamedTuple, Generic[Array]):
     positions: Array
     """(M, 3), metres, LiDAR frame."""
     groups: Array
-    """(M, samples) what is around each, see `ball_query`."""
+    """(M, samples) group of each position, see `ball_query`."""
     nearest: Array
-    """Of each position of the scale before the three nearest of these, (_, 3); of the finest scale (0, 3)."""
+    """Indices of the three nearest of these for each position of the next finer scale, (_, 3); (0, 3) for the
+    finest."""
     nearest_weights: Array
-    """Likewise inverse distances, sum 1."""
+    """Normalized inverse distances to `nearest`, sum 1."""
 
 
 def point_scales(
     points: NDArray[np.float32], keypoints: NDArray[np.float32], radii_m: Sequence[float], samples: int
 ) -> tuple[PointScale[NDArray[Any]], ...]:
-    """A scale for each radius, the finest first: all keypoints, the first quarter of them, the first sixteenth.
+    """Return a scale for each radius, the finest first: all keypoints, the first quarter of them, the first sixteenth.
 
-    Keypoints are farthest points in the order in which they were taken, so that the first of them are what sampling
-    the keypoints again would take.
+    Keypoints are in the order of farthest-point sampling, so that the first of them are those that sampling the
+    keypoints again would give.
 
     Args:
         points: (N, >=3) finite, metres, LiDAR frame.

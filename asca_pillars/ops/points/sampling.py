@@ -1,4 +1,4 @@
-"""Points in columns seen from above, keypoints by farthest-point sampling, and a map read at positions."""
+"""Points sorted into columns, farthest-point sampling, and bilinear interpolation of maps."""
 
 from typing import Any, NamedTuple
 
@@ -27,7 +27,7 @@ class Columns(NamedTuple):
 
 
 def require_points(points: NDArray[Any]) -> NDArray[np.float32]:
-    """Points (N, >=3), x, y, z in metres first, as contiguous float32; themselves if they are.
+    """Return points (N, >=3), x, y, z in metres first, as contiguous float32, without a copy if possible.
 
     Raises:
         ValueError: another shape, or a coordinate that is not finite, which has no column.
@@ -42,7 +42,7 @@ def require_points(points: NDArray[Any]) -> NDArray[np.float32]:
 
 
 def sort_into_columns(xyz: NDArray[np.float32], column_m: float) -> Columns:
-    """Columns of points (N, >=3), about `column_m` wide; N may be 0."""
+    """Sort points (N, >=3) into columns about `column_m` wide; N may be 0."""
     if not len(xyz):
         return Columns(
             np.empty(0, np.int32), np.zeros(2, np.int32), (np.float32(0), np.float32(0)), np.float32(1), (1, 1)
@@ -57,7 +57,7 @@ def sort_into_columns(xyz: NDArray[np.float32], column_m: float) -> Columns:
 
 
 def cells_of(xyz: NDArray[np.float32], columns: Columns) -> NDArray[np.int64]:
-    """Row and column of positions: (N, 3) in metres -> (N, 2); beside the points below 0 or beyond `columns.shape`."""
+    """Return row and column of positions: (N, 3) in metres -> (N, 2); outside below 0 or beyond `columns.shape`."""
     along_x, along_y = (
         np.clip((xyz[:, axis] - low) * columns.per_m, np.float32(-1e6), np.float32(1e6))
         for axis, low in enumerate(columns.origin_m)
@@ -69,11 +69,11 @@ _COLUMN_M = 1.5  # 1 to 3 m take about as long
 
 
 def farthest_points(points: NDArray[Any], count: int) -> NDArray[np.int32]:
-    """Indices of points that lie far from each other, in the order in which they are taken.
+    """Return indices of points by farthest-point sampling, in the order in which they are taken.
 
-    The first point, then again and again the one whose nearest taken point is farthest, by squared distance in
-    float32; of equally far ones the earlier. Points are kept in columns, of which only those are looked into that a
-    new sample can change.
+    Sampling starts with the first point, then repeatedly takes the one farthest from its nearest sample, by squared
+    distance in float32; of equally far ones the earlier. Points are sorted into columns, of which only those that a new
+    sample can change are visited.
 
     Args:
         points: (N, >=3) finite x, y, z in metres; N may be 0.
@@ -91,9 +91,9 @@ def farthest_points(points: NDArray[Any], count: int) -> NDArray[np.int32]:
 def points_near_boxes(
     points: NDArray[np.float32], boxes: NDArray[np.floating[Any]], margin_m: float
 ) -> NDArray[np.float32]:
-    """The points within `margin_m` of the circles around boxes seen from above: (N, 4), (R, 7) -> (M, 4).
+    """Return the points within `margin_m` of the circles around boxes seen from above: (N, 4), (R, 7) -> (M, 4).
 
-    Keypoints are worth more where proposals are (PV-RCNN++, arXiv 2102.00463, section 4.1).
+    Proposal-centric sampling of keypoints (PV-RCNN++, arXiv 2102.00463, section 4.1).
     """
     points = np.ascontiguousarray(points, np.float32)
     centers = boxes[:, :2].astype(np.float32)
@@ -104,9 +104,9 @@ def points_near_boxes(
 def bilinear_cells(
     points: NDArray[np.floating[Any]], x_m: NDArray[np.floating[Any]], y_m: NDArray[np.floating[Any]]
 ) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
-    """Flat indices row * W + column of the cells around each position, and their weights: (K, >= 2) -> 2 x (K, 4).
+    """Return flat indices row * W + column of the cells around positions, and weights: (K, >= 2) -> 2 x (K, 4).
 
-    Weights are not negative and sum to 1; beside the map its border counts.
+    Weights are not negative and sum to 1; outside the map, positions are clamped to its border.
 
     Args:
         points: x, y in metres first.
@@ -120,7 +120,7 @@ def bilinear_cells(
 
 
 def read_map(rows: NDArray[Any], cells: NDArray[np.int32], weights: NDArray[np.float32]) -> NDArray[np.float32]:
-    """A map's features at K positions, (K, C), from its cells (H * W, C) and what `bilinear_cells` gave, (K, 4).
+    """Interpolate a map's features at K positions, (K, C), from its cells (H * W, C) and `bilinear_cells`, (K, 4).
 
     Cells are float32, or uint8 steps, of which the result is in steps too.
     """
@@ -131,7 +131,7 @@ def read_map(rows: NDArray[Any], cells: NDArray[np.int32], weights: NDArray[np.f
 def _between(
     values: NDArray[np.floating[Any]], centers: NDArray[np.floating[Any]]
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """The cell before each value, and how far the value is on the way to the next, 0 to 1."""
+    """Return the index of the cell before each value, and the fraction of the way to the next, 0 to 1."""
     centers = centers.astype(np.float64)
     before = np.clip(np.searchsorted(centers, values, side="right") - 1, 0, len(centers) - 2)
     share = (values - centers[before]) / (centers[before + 1] - centers[before])

@@ -1,4 +1,4 @@
-"""The loops of `columns`, `farthest_points` and `bilinear`, compiled; tests/ops/numpy_kernels.py has them in NumPy."""
+"""Compiled loops of `columns`, `farthest_points` and `bilinear`; tests/ops/numpy_kernels.py has them in NumPy."""
 
 import math
 from typing import Any
@@ -31,14 +31,14 @@ _COLUMNS = (
 def sort(
     xyz: _Floats, x_low: np.float32, y_low: np.float32, per_m: np.float32, ny: int, nx: int
 ) -> tuple[_Integers, _Integers]:
-    """`numpy_kernels._sort`, by counting: (N, 3), metres -> `Columns.order` (N,), `Columns.starts` (ny * nx + 1,)."""
+    """Compute `numpy_kernels._sort` by counting: (N, 3) -> `Columns.order` (N,), `Columns.starts` (ny * nx + 1,)."""
     order, starts = np.empty(len(xyz), np.int32), np.zeros(ny * nx + 1, np.int32)
     _sort(xyz, x_low, y_low, per_m, nx, np.empty(len(xyz), np.int32), order, starts)
     return order, starts
 
 
 def farthest_points(xyz: _Floats, count: int, columns: Columns) -> _Integers:
-    """`numpy_kernels._farthest_points`, column by column: (N, 3) in metres -> indices (S,), S at most `count`."""
+    """Compute `numpy_kernels._farthest_points` by columns: (N, 3) in metres -> indices (S,), S at most `count`."""
     cells = len(columns.starts) - 1
     chosen = np.empty(min(count, len(xyz)), np.int32)
     found = _farthest_points(
@@ -50,7 +50,7 @@ def farthest_points(xyz: _Floats, count: int, columns: Columns) -> _Integers:
 
 
 def near_circles(points: _Floats, centers: _Floats, squared: _Floats) -> _Floats:
-    """`numpy_kernels._near_circles`: rows (N, 4), circles (R, 2) in metres, (R,) in m² -> rows (M, 4)."""
+    """Compute `numpy_kernels._near_circles`: rows (N, 4), circles (R, 2) in metres, (R,) in m² -> rows (M, 4)."""
     if not len(centers):
         return points[:0]
     reach = np.sqrt(squared)[:, None]
@@ -67,7 +67,7 @@ def near_circles(points: _Floats, centers: _Floats, squared: _Floats) -> _Floats
 
 
 def read_map(rows: NDArray[Any], cells: _Integers, weights: _Floats) -> _Floats:
-    """`numpy_kernels._read_map`: rows (H * W, C) float32 or uint8, cells and weights (K, 4) -> (K, C)."""
+    """Compute `numpy_kernels._read_map`: rows (H * W, C) float32 or uint8, cells and weights (K, 4) -> (K, C)."""
     read = np.zeros((len(cells), rows.shape[1]), np.float32)
     (_read_steps if rows.dtype == np.uint8 else _read_floats)(rows, cells, weights, read)
     return read
@@ -79,7 +79,7 @@ def _flat(columns: Columns) -> tuple[Any, ...]:
 
 @inner
 def _column(value: Any, low: Any, per_m: Any) -> int:
-    """`columns.cells_of` of one value."""
+    """Compute `columns.cells_of` of one value."""
     return math.floor(min(max((value - low) * per_m, np.float32(-1e6)), np.float32(1e6)))
 
 
@@ -135,10 +135,10 @@ def _farthest_points(
 ) -> int:
     """Choose sample after sample, each the farthest from those before it.
 
-    `sorted_points`: x, y, z and squared distance to the nearest sample, in `order`. Of each column, `boxes`: what
-    bounds its points, low and high; `largest`: of their distances, and `best`: where.
+    `sorted_points`: x, y, z and squared distance to the nearest sample, in `order`. For each column, `boxes`: bounds of
+    its points, low and high; `largest`: of their distances, and `best`: its index.
 
-    A column is looked into only if its box is nearer to the new sample than the largest distance in it; rounding keeps
+    A column is visited only if its box is nearer to the new sample than the largest distance in it; rounding keeps
     distances in order, so none is missed.
     """
     xs, ys, zs, nearest = sorted_points[0], sorted_points[1], sorted_points[2], sorted_points[3]
@@ -218,9 +218,9 @@ def _near_circles(
     links: _Integers,
     near: _Floats,
 ) -> int:
-    """`heads`: of each cell, whether a circle covers it or none is near, or where its list begins in `links`.
+    """Kernel of `near_circles`; `heads`: state of a cell (covered, none near), or its first entry in `links`.
 
-    `links`: a circle whose border may run through the cell, and where the list goes on.
+    `links`: linked lists of circles whose border may cross the cell: circle, next entry.
     """
     ny, nx = heads.shape
     used = 0

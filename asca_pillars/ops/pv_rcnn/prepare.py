@@ -1,4 +1,4 @@
-"""What the host computes for PV-RCNN of one scan: voxels, tables, keypoints and their neighbors (sections 3.1, 3.2)."""
+"""Host computation of PV-RCNN for one scan: voxels, rulebooks, keypoints and their neighbors (3.1, 3.2)."""
 
 import math
 from collections.abc import Sequence
@@ -23,7 +23,7 @@ Deform = Literal["none", "paper", "authors", "authors_frozen"]
 Source = Literal["points", "conv1", "conv2", "conv3", "conv4"]
 LEVEL_SOURCES: tuple[Source, ...] = ("conv1", "conv2", "conv3", "conv4")
 MOST_VECTOR_CELLS = 7
-"""Along an axis of a cube: more are more weights than keypoints to teach them."""
+"""Upper bound of cells along an axis of a cube; with more, weights outnumber the keypoints that train them."""
 
 
 def _are_radii(radii_m: Sequence[float]) -> bool:
@@ -32,7 +32,7 @@ def _are_radii(radii_m: Sequence[float]) -> bool:
 
 @dataclass(frozen=True)
 class SourceBalls(Strict):
-    """What voxel set abstraction aggregates of one source around a keypoint.
+    """Balls of one source that voxel set abstraction aggregates around a keypoint.
 
     Attributes:
         source: raw points, or the voxels of a level of the backbone.
@@ -59,11 +59,11 @@ class VoxelSetSettings(GridSettings):
 
     Attributes:
         keypoints: of a scan, at most.
-        sources: what keypoints aggregate beside the map seen from above.
+        sources: aggregated by keypoints besides the bird's-eye-view map.
         scale_radii_m: of groups of raw points at scales that have all keypoints, a quarter of them, a sixteenth, ...,
             the finest first (AFE-RCNN's adaptive features); none without.
         scale_samples: of each of these groups at most.
-        deform: where keypoints look for voxels. `none`: around themselves. `paper`: around a place learnt from their
+        deform: centers of keypoints' balls. `none`: the keypoints. `paper`: a position predicted from their
             surroundings, one for each level (Deformable PV-RCNN). `authors`: one for each level and radius, as in that
             paper's code. `authors_frozen`: likewise, learning nothing through the place, as that code does.
         proposals: which of the first stage's boxes are refined.
@@ -108,16 +108,16 @@ class VoxelSetSettings(GridSettings):
 
     @property
     def deformed(self) -> tuple[SourceBalls, ...]:
-        """The sources around whose shifted places keypoints look: the levels, if any."""
+        """Sources aggregated around shifted positions: the levels, if there is deformation."""
         return tuple(each for each in self.sources if self.deform != "none" and each.source != "points")
 
     @property
     def nearest_wanted(self) -> bool:
-        """Whether the three nearest voxels of a keypoint are asked for."""
+        """True if the three nearest voxels of a keypoint are needed."""
         return self.deform == "paper"
 
     def places(self, each: SourceBalls) -> int:
-        """How many places around which this source is looked at; 0: the keypoint itself."""
+        """Return the number of shifted positions per keypoint for this source; 0: the keypoint's own position."""
         if each not in self.deformed:
             return 0
         return 1 if self.deform == "paper" else len(each.radii_m)
@@ -135,25 +135,25 @@ class VoxelScan(NamedTuple):
     keypoints: NDArray[np.float32]
     """(K, 3), metres, LiDAR frame."""
     positions: tuple[NDArray[np.float32], ...]
-    """Of each source, the (N, 3) that its indices count: points, or centers of voxels; metres."""
+    """Positions (N, 3) that the indices of each source refer to: points, or voxel centers; metres."""
     ball_indices: tuple[tuple[NDArray[np.int32], ...], ...]
-    """Of each source and radius (K, samples)."""
+    """Ball indices (K, samples) for each source and radius."""
     nearest: tuple[NDArray[np.int32], ...]
-    """Of each source (K, 3) voxels, see `three_nearest`; (0, 3) where they are not asked for."""
+    """Nearest voxels (K, 3) for each source, see `three_nearest`; (0, 3) where they are not needed."""
     nearest_weights: tuple[NDArray[np.float32], ...]
     bev_cells: NDArray[np.int32]
-    """(K, 4) flat indices into the map seen from above, see `bilinear_cells`."""
+    """(K, 4) flat indices into the bird's-eye-view map, see `bilinear_cells`."""
     bev_weights: NDArray[np.float32]
     """(K, 4)."""
     scales: tuple[PointScale[NDArray[Any]], ...]
-    """Of raw points around keypoints, the finest first; none where they are not asked for."""
+    """Scales of raw points around keypoints, finest first; empty where they are not needed."""
     counts: ScanCounts
 
 
 def voxel_scan(
     points: NDArray[np.float32], spec: VoxelSpec, settings: VoxelSetSettings, builder: VoxelRulebookBuilder
 ) -> VoxelScan:
-    """Voxels, tables, keypoints and their neighbors of the finite points (N, 4) of one scan.
+    """Return voxels, rulebooks, keypoints and their neighbors of the finite points (N, 4) of one scan.
 
     Args:
         points: x, y, z in metres, LiDAR frame, and reflectance.
@@ -174,7 +174,7 @@ class VoxelizedScan(NamedTuple):
 
 
 def voxel_levels(points: NDArray[np.float32], spec: VoxelSpec, builder: VoxelRulebookBuilder) -> VoxelizedScan:
-    """Voxels and tables of finite points (N, 4), metres, LiDAR frame, see `voxel_scan`."""
+    """Return voxels and rulebooks of finite points (N, 4), metres, LiDAR frame, see `voxel_scan`."""
     voxels = voxelize(points, spec.grid, builder.maps[0])
     counts = ScanCounts(len(points), voxels.points_outside, 0)
     return VoxelizedScan(voxels.features, tuple(builder.build()), counts)
@@ -183,7 +183,7 @@ def voxel_levels(points: NDArray[np.float32], spec: VoxelSpec, builder: VoxelRul
 def with_neighbors(
     points: NDArray[np.float32], voxelized: VoxelizedScan, spec: VoxelSpec, settings: VoxelSetSettings
 ) -> VoxelScan:
-    """Keypoints among the points (N, 4), metres, LiDAR frame, and what lies around them, see `voxel_scan`."""
+    """Return the scan with keypoints among the points (N, 4), metres, LiDAR frame, and neighbors, see `voxel_scan`."""
     features, levels, counts = voxelized
     inside = np.ascontiguousarray(points[spec.grid.inside(points)])
     keypoints = np.ascontiguousarray(inside[farthest_points(inside, settings.keypoints), :3])

@@ -37,7 +37,7 @@ class VoxelLevel(NamedTuple, Generic[Array]):
 
 
 class VoxelRulebookBuilder:
-    """Builds the rulebooks of scan after scan, in memory of its own: for one thread at a time.
+    """Builder of a backbone's rulebooks, which reuses its memory: for one thread at a time.
 
     Args:
         shape: of the first level's lattice, cells along z, y, x.
@@ -61,14 +61,14 @@ class VoxelRulebookBuilder:
             raise ValueError(f"{len(strided)} strided convolutions join {len(strided) + 1} levels, not {submanifold}")
         self.strided, self.submanifold, self.training = tuple(strided), tuple(submanifold), training
         self.maps = [CellMap(shape)]
-        """One for each level; the first is filled by whoever finds the voxels."""
+        """Map of each level; the caller fills the first one with the voxels."""
         for convolution in strided:
             self.maps.append(CellMap(convolution.output_shape(self.maps[-1].shape)))
         self._strided_maps = [join(*each) for each in zip(self.strided, self.maps[:-1], self.maps[1:], strict=True)]
         self._submanifold_maps = [join(SUBMANIFOLD, level, level) for level in self.maps]
 
     def build(self) -> list[VoxelLevel[NDArray[Any]]]:
-        """Rulebooks for the active cells of `maps[0]`, level by level."""
+        """Build the rulebooks for the active cells of `maps[0]`, level by level."""
         levels = [self._level(0)]
         for number, stride in enumerate(self._strided_maps, start=1):
             stride.target.activate_joined([(stride.source, stride.outputs)])
@@ -85,7 +85,7 @@ class VoxelRulebookBuilder:
 def stack_voxel_levels(
     frames: Sequence[Sequence[VoxelLevel[NDArray[Any]]]], shapes: Sequence[Shape]
 ) -> list[VoxelLevel[NDArray[Any]]]:
-    """Levels of a batch from those of its frames; `shapes` are the levels' lattices, cells along z, y, x."""
+    """Stack the levels of frames into those of a batch; `shapes` are the levels' lattices, cells along z, y, x."""
     stacked: list[VoxelLevel[NDArray[Any]]] = []
     before: list[int] = []
     for number, shape in enumerate(shapes):

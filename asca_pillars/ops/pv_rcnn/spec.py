@@ -1,4 +1,4 @@
-"""One voxel detector's numbers, all that training and the vehicle must agree on. `bundle.json` carries it."""
+"""Spec of a voxel detector, shared by training, export and runtime; stored in `bundle.json`."""
 
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -15,7 +15,7 @@ from asca_pillars.ops.pv_rcnn.voxels import VoxelGrid
 from asca_pillars.ops.sparse.rulebooks import Convolution, Shape
 
 MAP_MULTIPLE = 2
-"""The blocks of the neck that halve the map do so once."""
+"""Required divisor of the map's rows and columns: the neck halves the map once."""
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,7 @@ class VoxelSpec(DetectorSpec):
 
     Attributes:
         grid: of the voxels.
-        last_stride: of conv4 seen from above; along z it always halves. With 1 the map has cells of four voxels instead
+        last_stride: of conv4 along x and y; along z it always halves. With 1 the map has cells of four voxels instead
             of eight, and conv4's first convolution has a kernel along z alone: one that kept the resolution and grew
             sideways would more than double the active cells.
         anchor_places: `ends`: anchors stand evenly from one end of the range to the other, both included, as in the
@@ -51,7 +51,7 @@ class VoxelSpec(DetectorSpec):
 
     @property
     def ranges(self) -> Ranges:
-        """Where objects are looked for."""
+        """Detection ranges."""
         return Ranges(*self.grid.ranges_m)
 
     @cached_property
@@ -81,21 +81,21 @@ class VoxelSpec(DetectorSpec):
 
     @property
     def scores_per_anchor(self) -> int:
-        """How many scores each anchor has: one for every class."""
+        """Number of scores of each anchor: one per class."""
         return len(self.classes)
 
     @property
     def map_stride(self) -> int:
-        """Voxels along x and along y of a cell of the map seen from above."""
+        """Voxels along x and along y of a cell of the bird's-eye-view map."""
         return self.level_strides[-1][1]
 
     @property
     def map_shape(self) -> tuple[int, int]:
-        """Rows and columns of the map seen from above, on which the head answers."""
+        """Rows and columns of the bird's-eye-view map, that of the head."""
         return self.level_shapes[-1][1:]
 
     def map_places_m(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Where the map's features stand: x of its columns (W,), y of its rows (H,), metres, LiDAR frame.
+        """Return the positions of the map's features: x of its columns (W,), y of its rows (H,), metres, LiDAR frame.
 
         A strided convolution with padding 1 centers its output on the first of its voxels, so a cell stands at its
         lower end.
@@ -105,7 +105,7 @@ class VoxelSpec(DetectorSpec):
         return self.grid.x_range_m[0] + step_x * columns, self.grid.y_range_m[0] + step_y * rows
 
     def head_centers_m(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Where anchors stand: x of the head map's columns (W,), y of its rows (H,), metres, LiDAR frame."""
+        """Return anchor centers in metres, LiDAR frame: x of the head map's columns (W,), y of its rows (H,)."""
         rows, columns = self.map_shape
         if self.anchor_places == "ends":
             return np.linspace(*self.grid.x_range_m, columns), np.linspace(*self.grid.y_range_m, rows)
@@ -114,5 +114,5 @@ class VoxelSpec(DetectorSpec):
         return x + half[0], y + half[1]
 
     def rulebook_builder(self, *, training: bool = False) -> VoxelRulebookBuilder:
-        """Of this detector's levels; for one thread at a time."""
+        """Return a builder of rulebooks for this detector's levels; for one thread at a time."""
         return VoxelRulebookBuilder(self.grid.shape, self.strided, training=training)

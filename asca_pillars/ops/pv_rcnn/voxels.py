@@ -1,4 +1,4 @@
-"""Points -> voxels: small boxes of space, each with the mean of its first points (SECOND, PV-RCNN)."""
+"""Voxelization: the mean of the first points in each cell of a 3D grid (SECOND, PV-RCNN)."""
 
 import math
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ from asca_pillars.base.strict import Strict
 from asca_pillars.ops.sparse.rulebooks import MAX_Z_CELLS, CellMap, Shape
 
 KERNELS = "asca_pillars.ops.pv_rcnn.kernels"
-_TOLERANCE = 1e-2  # of a number of voxels: room for float dust and for sizes written with few digits
+_TOLERANCE = 1e-2  # of a voxel, for rounding errors and for sizes written with few digits
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ class VoxelGrid(Strict):
 
     @property
     def ranges_m(self) -> tuple[tuple[float, float], tuple[float, float], tuple[float, float]]:
-        """Along x, y, z."""
+        """Ranges along x, y, z."""
         return self.x_range_m, self.y_range_m, self.z_range_m
 
     @cached_property
@@ -74,7 +74,7 @@ class VoxelGrid(Strict):
     def centers_m(
         self, cells: NDArray[np.int64], shape: Shape | None = None, strides: Shape = (1, 1, 1)
     ) -> NDArray[np.float32]:
-        """Centers x, y, z of these voxels: (N,) -> (N, 3), metres.
+        """Return centers x, y, z of these voxels: (N,) -> (N, 3), metres.
 
         Args:
             cells: flat indices on the lattice.
@@ -89,7 +89,7 @@ class VoxelGrid(Strict):
         return (lows + (np.stack([x, y, z], axis=-1) + 0.5) * sizes).astype(np.float32)
 
     def cells(self, points: NDArray[np.floating[Any]]) -> NDArray[np.int64]:
-        """Flat index (y * nx + x) * nz + z of each point's voxel, or -1 outside the ranges.
+        """Return the flat index (y * nx + x) * nz + z of each point's voxel, or -1 outside the ranges.
 
         A border belongs to the voxel above it. Points are compared as float32.
 
@@ -109,7 +109,7 @@ class VoxelGrid(Strict):
         return cells
 
     def inside(self, points: NDArray[np.float32]) -> NDArray[np.bool_]:
-        """Which points (M, >= 3), metres, LiDAR frame, lie in a voxel: (M,)."""
+        """Return a mask (M,) of the points (M, >= 3), metres, LiDAR frame, that lie in a voxel."""
         lows_m, highs_m = (np.array(ends, np.float32) for ends in zip(*self.ranges_m, strict=True))
         return np.asarray(((points[:, :3] >= lows_m) & (points[:, :3] < highs_m)).all(axis=1))
 

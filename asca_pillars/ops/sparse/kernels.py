@@ -1,7 +1,7 @@
-"""The loops of `CellMap`, compiled; tests/ops/numpy_kernels.py has them in NumPy.
+"""Compiled loops of `CellMap`; tests/ops/numpy_kernels.py has them in NumPy.
 
 Masks stay uint64 throughout, because numba turns a sum of uint64 and int64 into a float; indices are unsigned where it
-matters, because with others it looks for negative ones, which count from the end.
+matters, because for signed ones it checks for negative values, which count from the end.
 """
 
 from typing import Any
@@ -23,7 +23,7 @@ _LINKS = (given(types.int64, 2),) * 3
 
 @inner
 def bits_set(mask: np.uint64) -> Any:
-    """How many are set."""
+    """Return the number of set bits."""
     mask = mask - ((mask >> np.uint64(1)) & np.uint64(0x5555555555555555))
     mask = (mask & np.uint64(0x3333333333333333)) + ((mask >> np.uint64(2)) & np.uint64(0x3333333333333333))
     mask = (mask + (mask >> np.uint64(4))) & np.uint64(0x0F0F0F0F0F0F0F0F)
@@ -32,7 +32,7 @@ def bits_set(mask: np.uint64) -> Any:
 
 @inner
 def bits_of(mask: _Masks, start: _Rows, column: np.uint64) -> Any:
-    """The active cells of a column; on a lattice one cell high, which has no masks, the lowest bit alone."""
+    """Return the active cells of a column; on a lattice one cell high, which has no masks, the lowest bit alone."""
     return mask[column] if len(mask) else np.uint64(start[column] >= 0)
 
 
@@ -62,7 +62,7 @@ def enter_cells(cells: _Integers, nz: int, mask: _Masks, start: _Rows) -> None:
 
 @inner
 def _mark(mask: _Masks, start: _Rows, column: np.uint64, bits: np.uint64) -> Any:
-    """Set these bits of a column, and say how many were not set before."""
+    """Set these bits of a column, and return how many were not set before."""
     new = bits & ~bits_of(mask, start, column)
     if new and len(mask):
         mask[column] |= new
@@ -73,7 +73,7 @@ def _mark(mask: _Masks, start: _Rows, column: np.uint64, bits: np.uint64) -> Any
 
 @inner
 def _mark_flat(cells: _Integers, y_links: _Integers, x_links: _Integers, taps: int, nx: int, start: _Rows) -> Any:
-    """`mark_joined` where both lattices are one cell high and the kernel is square, several times as fast."""
+    """Compute `mark_joined` where both lattices are one cell high and the kernel is square, several times as fast."""
     nowhere, width = np.uint64(len(start) - 1), len(x_links)
     row, found = 0, np.int64(0)
     start[nowhere] = 0
@@ -97,7 +97,7 @@ def _mark_flat(cells: _Integers, y_links: _Integers, x_links: _Integers, taps: i
 
 @compiled(_CELLS, types.int64, written(types.uint64), written(types.int32))
 def mark_points(cells: _Integers, nz: int, mask: _Masks, start: _Rows) -> int:
-    """Set the bits of the points' cells, flat indices (M,) or -1, and say how many were not set before."""
+    """Set the bits of the points' cells, flat indices (M,) or -1, and return how many were not set before."""
     found = 0
     for i in range(len(cells)):
         if cells[i] >= 0:
@@ -116,7 +116,7 @@ def mark_joined(
     mask: _Masks,
     start: _Rows,
 ) -> int:
-    """Set the bits of what is joined with these cells, and say how many were not set before.
+    """Set the bits of the cells joined with these cells, and return how many were not set before.
 
     `cells`: (N,) flat indices; links: (cells along an axis, taps) indices along it; columns: (ny * nx,).
     """
@@ -152,7 +152,7 @@ def mark_joined(
 
 @compiled(given(types.uint64), written(types.int32), types.int64, written(types.int64))
 def list_cells(mask: _Masks, start: _Rows, nz: int, cells: _Integers) -> None:
-    """The cells whose bits are set, ascending flat indices (N,), and where each column (ny * nx,) starts among them.
+    """List the cells whose bits are set, ascending flat indices (N,), and where each column (ny * nx,) starts.
 
     `cells` comes with room for one more.
     """
@@ -187,7 +187,7 @@ def _fill_flat(
     missing: np.int32,
     table: _Rows,
 ) -> None:
-    """`fill_table` where both lattices are one cell high and the kernel is square, several times as fast."""
+    """Compute `fill_table` where both lattices are one cell high and the kernel is square, several times as fast."""
     nowhere, width = np.uint64(len(start) - 1), len(x_links)
     row = 0
     for i in range(len(cells)):
@@ -215,7 +215,7 @@ def fill_table(
     missing: np.int32,
     table: _Rows,
 ) -> None:
-    """`CellMap.table`, column by column: cells (N,) -> indices (N, K)."""
+    """Compute `CellMap.table`, column by column: cells (N,) -> indices (N, K)."""
     depth, width = len(z_links), len(x_links)
     taps_z, taps_y, taps_x = z_links.shape[1], y_links.shape[1], x_links.shape[1]
     if not len(mask) and depth == taps_z == 1 and taps_y == taps_x:
@@ -263,7 +263,7 @@ def fill_places(
     halvings: int,
     places: _Rows,
 ) -> None:
-    """`CellMap.places`: cells (N,) -> indices (N,)."""
+    """Compute `CellMap.places`: cells (N,) -> indices (N,)."""
     row, within = 0, (1 << halvings) - 1
     for i in range(len(cells)):
         while cells[i] >= (row + 1) * nx:

@@ -1,8 +1,9 @@
-"""Sparse convolutions: which cells a kernel joins, the active cells of a lattice, and the rulebooks between two.
+"""Rulebooks of sparse convolutions: geometry of a convolution, active cells of a lattice, links between lattices.
 
-A lattice is made of columns: along z a cell is one bit of its column's 64-bit mask, so that a cell's row is the row
-at which its column starts plus the number of bits set below it. No hash, no sort. Active cells are ordered by
-(y, x, z), z running fastest, which makes every rulebook and every network output independent of threads and machine.
+A lattice is made of columns: along z a cell is one bit of its column's 64-bit mask, so that a cell's row is the row at
+which its column starts plus the number of bits set below it. This needs neither hashing nor sorting. Active cells are
+ordered by (y, x, z), z running fastest, which makes every rulebook and every network output independent of threads and
+machine.
 """
 
 import math
@@ -18,11 +19,11 @@ from asca_pillars.base.errors import ConfigError
 from asca_pillars.base.kernels import load_kernels
 
 Shape = tuple[int, int, int]
-"""Cells along z, y, x; a map seen from above has one along z."""
+"""Cells along z, y, x; a bird's-eye-view map has one along z."""
 
 
 class Links(NamedTuple):
-    """What each tap joins a cell of one lattice with on another, axis by axis.
+    """Cells of two lattices that each tap of a convolution joins, per axis.
 
     Tap (kz, ky, kx) joins cell (z, y, x) with (links.z[z, kz], links.y[y, ky], links.x[x, kx]), or with nothing where
     one of them is -1.
@@ -55,27 +56,27 @@ class Convolution:
                 )
 
     def output_shape(self, shape: Shape) -> Shape:
-        """Cells of the output for an input of this shape."""
+        """Return the shape of the output for an input of this shape."""
         sizes = zip(shape, self.kernel, self.stride, self.padding, strict=True)
         z, y, x = ((size + 2 * padding - kernel) // stride + 1 for size, kernel, stride, padding in sizes)
         return z, y, x
 
     @property
     def taps(self) -> int:
-        """K, the kernel's cells."""
+        """Number of taps K of the kernel."""
         return math.prod(self.kernel)
 
     def inputs(self, outputs: Shape, inputs: Shape) -> Links:
-        """From an output to the inputs that it reads, on lattices of these shapes."""
+        """Return the links from an output cell to the input cells that it reads, on lattices of these shapes."""
         return _links(self, outputs, inputs, backward=False)
 
     def outputs(self, inputs: Shape, outputs: Shape) -> Links:
-        """From an input to the outputs that read it."""
+        """Return the links from an input cell to the output cells that read it."""
         return _links(self, inputs, outputs, backward=True)
 
 
 def map_convolution(kernel: int, stride: int = 1, padding: int = 0) -> Convolution:
-    """For a bird's-eye map: nothing happens along z."""
+    """Return a convolution on a bird's-eye-view map, of kernel size 1 along z."""
     return Convolution((1, kernel, kernel), (1, stride, stride), (0, padding, padding))
 
 
@@ -106,7 +107,7 @@ class Columns(NamedTuple):
 
 
 class CellMap:
-    """Which cells of a lattice are active; made once, its memory is kept from scan to scan.
+    """Active cells of a lattice; made once, its memory is reused from scan to scan.
 
     Changing the active cells clears only the columns that were in use.
 
@@ -151,7 +152,7 @@ class CellMap:
         self._list_cells(self._kernels.mark_points(cell_of_point, self.shape[0], *self.columns))
 
     def activate_joined(self, sources: Sequence[tuple["CellMap", Links]]) -> None:
-        """Make active what any tap joins with an active cell of any of the sources, none of which may be this map."""
+        """Activate the cells that any tap joins with an active cell of a source; this map must not be a source."""
         self._kernels.clear_columns(self.cells, self.shape[0], *self.columns)
         found = 0
         for source, links in sources:
@@ -159,26 +160,26 @@ class CellMap:
         self._list_cells(found)
 
     def _list_cells(self, count: int) -> None:
-        """Make active what the kernels have marked, so many cells."""
+        """Activate the cells that the kernels have marked, of this number."""
         cells = np.empty(count + 1, np.int64)
         self._kernels.list_cells(*self.columns, self.shape[0], cells)
         self.cells = cells[:count]
 
     def table(self, source: "CellMap", links: Links) -> NDArray[np.int32]:
-        """Index of the row in `source` that each tap joins with each active cell: (N, K), len(source) for none.
+        """Return the row in `source` that each tap joins with each active cell: (N, K), len(source) for none.
 
-        With `Convolution.inputs` it is what the convolution from `source` to this map reads. With `outputs` it is
-        the inverse that its backward pass reads: which output, of the map `source`, each input was read by.
+        With `Convolution.inputs` it is the rulebook of the convolution from `source` to this map. With `outputs` it is
+        the inverse for the backward pass: the output, on the map `source`, that read each input.
         """
         table = np.empty((len(self.cells), math.prod(axis.shape[1] for axis in links)), np.int32)
         self._kernels.fill_table(self.cells, *links, source.shape[2], *source.columns, len(source), table)
         return table
 
     def places(self, parents: "CellMap", halvings: int) -> NDArray[np.int32]:
-        """Row of each active cell of this map among the outputs of an upsampling that does not overlap.
+        """Return the row of each active cell of this map among the outputs of a non-overlapping upsampling.
 
-        Seen from above (one cell along z). Each parent cell has s^2 outputs, s = 2^halvings, its row of them before
-        the next parent's, (y, x) within the parent: (N,) int32, len(parents) * s^2 where the parent is not active.
+        For lattices one cell high. Each parent cell has s^2 outputs, s = 2^halvings, its row of them before the next
+        parent's, (y, x) within the parent: (N,) int32, len(parents) * s^2 where the parent is not active.
         """
         missing = len(parents) << (2 * halvings)
         places = np.empty(len(self.cells), np.int32)
@@ -189,34 +190,34 @@ class CellMap:
 
 
 class Join(NamedTuple):
-    """A convolution between two maps; made once, as they are, for scan after scan."""
+    """Convolution between two maps; made once for scan after scan."""
 
     source: CellMap
     target: CellMap
     inputs: Links
-    """From the cells of `target` to those of `source` that they read."""
+    """Links from the cells of `target` to the cells of `source` that they read."""
     outputs: Links
-    """From the cells of `source` to those of `target` that read them."""
+    """Links from the cells of `source` to the cells of `target` that read them."""
 
     def table(self) -> NDArray[np.int32]:
-        """What the convolution reads: (cells of `target`, K) rows of `source`, see `CellMap.table`."""
+        """Return the rulebook of the convolution: (cells of `target`, K) rows of `source`, see `CellMap.table`."""
         return self.target.table(self.source, self.inputs)
 
     def inverse(self) -> NDArray[np.int32]:
-        """What its backward pass reads: (cells of `source`, K) rows of `target`."""
+        """Return the rulebook of the backward pass: (cells of `source`, K) rows of `target`."""
         return self.source.table(self.target, self.outputs)
 
 
 def join(convolution: Convolution, source: CellMap, target: CellMap) -> Join:
-    """The convolution from one map to another."""
+    """Return the join of two maps by a convolution."""
     inputs = convolution.inputs(target.shape, source.shape)
     return Join(source, target, inputs, convolution.outputs(source.shape, target.shape))
 
 
 def stack_rows(tables: Sequence[NDArray[np.int32]], rows: Sequence[int]) -> NDArray[np.int32]:
-    """Tables (M_i, ...) of indices into features of `rows[i]` rows each -> one into all of them, (sum of M_i, ...).
+    """Stack tables (M_i, ...) of indices into features of `rows[i]` rows -> one into all of them, (sum of M_i, ...).
 
-    What is missing, row rows[i], becomes row sum(rows).
+    The index of a missing row, rows[i], becomes sum(rows).
     """
     starts, total = np.concatenate([[0], np.cumsum(rows)]).astype(np.int32), sum(rows)
     moved = [
@@ -227,5 +228,5 @@ def stack_rows(tables: Sequence[NDArray[np.int32]], rows: Sequence[int]) -> NDAr
 
 
 def stack_cells(cells: Sequence[NDArray[np.int32]], cells_per_frame: int) -> NDArray[np.int32]:
-    """Flat indices (M_i,) on each frame's map -> (sum of M_i,) on the maps of all frames, one after the other."""
+    """Stack flat indices (M_i,) on each frame's map -> (sum of M_i,) on the maps of all frames, one after the other."""
     return np.concatenate([each + np.int32(frame * cells_per_frame) for frame, each in enumerate(cells)])

@@ -1,4 +1,4 @@
-"""The last stop of two stages: proposals, confidences and residuals -> Detections."""
+"""Decoding of refined boxes: proposals, confidences and residuals -> Detections."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -13,11 +13,11 @@ from asca_pillars.detection.spec import DetectorSpec
 from asca_pillars.ops.two_stage.rois import decode_refinement
 
 Scores = Literal["second", "both"]
-"""Whose score a refined box has: the second stage's, or the geometric mean of its own and of its proposal's."""
+"""Score of a refined box: the second stage's, or the geometric mean of that and the proposal's."""
 
 
 def refined_scores(proposals: Detections, confidence: NDArray[np.float32], scores: Scores) -> NDArray[np.float32]:
-    """Scores (R,) in [0, 1] of refined boxes, from the second stage's confidence (R,), logits."""
+    """Return scores (R,) in [0, 1] of refined boxes, from the second stage's confidence (R,), logits."""
     own = sigmoid(confidence)
     return own if scores == "second" else np.sqrt(own * proposals.scores)
 
@@ -29,7 +29,7 @@ def reported_detections(
     spec: DetectorSpec,
     scores: Scores,
 ) -> Detections:
-    """Refined boxes whose scores reach the thresholds of `spec`, best first, after its suppression.
+    """Return the refined boxes whose scores reach the thresholds of `spec`, best first, after its suppression.
 
     Args:
         proposals: R of them.
@@ -54,7 +54,7 @@ def reported_frames(
     spec: DetectorSpec,
     scores: Scores,
 ) -> list[Detections]:
-    """`reported_detections` of several frames, whose logits (R,) and residuals (R, 7) follow one another."""
+    """Apply `reported_detections` to several frames, whose logits (R,) and residuals (R, 7) follow one another."""
     ends = np.cumsum([len(frame) for frame in proposals])[:-1]
     frames = zip(proposals, np.split(confidence, ends), np.split(residuals, ends), strict=True)
     return [reported_detections(*frame, spec, scores) for frame in frames]
@@ -63,14 +63,14 @@ def reported_frames(
 def refined_detections(
     proposals: Detections, scores: NDArray[np.float32], residuals: NDArray[np.float32], post: PostProcess
 ) -> Detections:
-    """Refined boxes, best first, after rotated suppression within each class; those not finite are counted.
+    """Return refined boxes, best first, after rotated NMS within each class; non-finite ones are counted.
 
     Args:
         proposals: R of them.
         scores: (R,) in [0, 1], which take the place of the first stage's, see `refined_scores`.
         residuals: (R, 7), see `decode_refinement`.
     """
-    with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is left out below
+    with np.errstate(over="ignore", invalid="ignore"):  # non-finite values are left out below
         boxes = decode_refinement(residuals, proposals.boxes)
     usable = np.isfinite(boxes).all(axis=1) & np.isfinite(scores)
     own = np.flatnonzero(usable)

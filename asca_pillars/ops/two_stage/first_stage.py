@@ -1,4 +1,4 @@
-"""What the second stage asks of the first: proposals, keypoints and what the first stage's map says there."""
+"""First-stage results that the second stage reads: proposals, keypoints and map features at the keypoints."""
 
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Protocol
@@ -16,10 +16,10 @@ from asca_pillars.ops.points.sampling import bilinear_cells, farthest_points, po
 
 
 class FirstPass(NamedTuple):
-    """What a first stage computes of one scan."""
+    """Outputs of a first stage for one scan."""
 
     maps: HeadMaps[NDArray[np.float32]]
-    """On the head's map, or in rows of its active cells."""
+    """Head maps, or rows of the head's active cells."""
     neck: NDArray[Any]
     """(H, W, C) the head's input on its map, or (M, C) at M active cells; beside these the map is zero. float32,
     or the uint8 steps of an 8-bit bundle."""
@@ -28,7 +28,7 @@ class FirstPass(NamedTuple):
 
 
 class FirstStage(Protocol):
-    """A trained one-stage detector that hands out its neck's map: a bundle or a checkpoint."""
+    """Trained one-stage detector that also returns its neck's map: a bundle or a checkpoint."""
 
     @property
     def spec(self) -> DetectorSpec:
@@ -36,7 +36,7 @@ class FirstStage(Protocol):
 
     @property
     def identity(self) -> str:
-        """Of its trained weights, whichever file they come from; differs for different ones."""
+        """Identifier of the trained weights, whichever file they come from."""
 
     def __call__(self, points: NDArray[np.float32]) -> FirstPass:
         """Run on one scan (N, 4)."""
@@ -44,11 +44,11 @@ class FirstStage(Protocol):
 
 @dataclass(frozen=True)
 class KeypointSettings(Strict):
-    """Which points of a scan become keypoints."""
+    """Settings for the choice of a scan's keypoints."""
 
     count: int = 768
     margin_m: float = 2.0
-    """They stand within this distance of the circles around the proposals; others would say nothing about them."""
+    """Largest distance of keypoints from the circles around the proposals."""
 
     def __post_init__(self) -> None:
         if self.count < 1 or not self.margin_m >= 0:
@@ -59,7 +59,7 @@ class KeypointSettings(Strict):
 
 @dataclass(frozen=True)
 class FirstStageSettings(Strict):
-    """All that decides what the second stage sees of the first."""
+    """Settings of the first-stage results that the second stage reads."""
 
     proposals: ProposalSettings = field(default_factory=ProposalSettings)
     keypoints: KeypointSettings = field(default_factory=KeypointSettings)
@@ -67,10 +67,10 @@ class FirstStageSettings(Strict):
 
 @dataclass(frozen=True)
 class Proposed:
-    """What the second stage sees of the first's work on one scan."""
+    """First-stage results of one scan that the second stage reads."""
 
     proposals: Detections
-    """R of them."""
+    """R proposals."""
     keypoints: NDArray[np.float32]
     """(K, 3) positions in metres, LiDAR frame."""
     bev: NDArray[np.float32]
@@ -99,7 +99,7 @@ def propose_on(stage: FirstStage, points: NDArray[np.float32], settings: FirstSt
 def proposed_from(
     found: FirstPass, points: NDArray[np.float32], spec: DetectorSpec, settings: FirstStageSettings
 ) -> Proposed:
-    """What the second stage sees of `found`, the first stage's answer to the finite points (N, 4) of one scan."""
+    """Return the second stage's input from the first stage's outputs `found` for finite points (N, 4) of one scan."""
     proposals = propose(found.maps, spec, settings.proposals, found.cells)
     near = points_near_boxes(points, proposals.boxes, settings.keypoints.margin_m)
     keypoints = np.ascontiguousarray(near[farthest_points(near, settings.keypoints.count), :3])

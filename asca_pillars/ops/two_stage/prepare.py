@@ -1,4 +1,4 @@
-"""What the host computes for the second stage of one scan: neighbours of keypoints and of the grids of proposals."""
+"""Host computation of the second stage for one scan: neighbors of keypoints and of the proposals' grid points."""
 
 import math
 from concurrent.futures import Executor
@@ -17,7 +17,7 @@ from asca_pillars.ops.two_stage.first_stage import Proposed
 from asca_pillars.ops.two_stage.rois import roi_grid_points
 
 ROI_FEATURES = 4
-"""Columns of `roi_features` beside one for each class."""
+"""Columns of `roi_features` besides the one-hot class."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class RefineSettings(GridSettings):
     """Balls and grids of the second stage."""
 
     ball_radii_m: tuple[float, ...] = (0.4, 0.8)
-    """Around keypoints, in which raw points are aggregated."""
+    """Radii of the balls around keypoints in which raw points are aggregated."""
     ball_samples: int = 16
 
     def __post_init__(self) -> None:
@@ -57,13 +57,13 @@ class GridNeighbors(NamedTuple):
     points: NDArray[np.float32]
     """(R * cells, 3), metres, LiDAR frame."""
     indices: tuple[NDArray[np.int32], ...]
-    """Of each radius (R * cells, samples), or of each cell of a cube the nearest (R * cells, T, 3); the number of
-    keypoints stands for nothing."""
+    """Ball indices (R * cells, samples) for each radius, or the nearest in each cell of a cube (R * cells, T, 3); the
+    number of keypoints marks an empty entry."""
 
 
 @dataclass(frozen=True)
 class RefineScan:
-    """One scan as the second stage takes it; `models.two_stage.layers.RefineInputs` says what each array is."""
+    """Input of the second stage for one scan; `models.two_stage.layers.RefineInputs` describes the arrays."""
 
     points: NDArray[np.float32]
     keypoints: NDArray[np.float32]
@@ -81,11 +81,11 @@ def refine_scan(
     settings: RefineSettings,
     executor: Executor | None = None,
 ) -> RefineScan:
-    """Neighbours for some proposals of a scan, in their order.
+    """Return the neighbors for some proposals of a scan, in their order.
 
     Args:
         points: (N, 4) of the scan.
-        proposed: what the first stage says of it.
+        proposed: first-stage results of it.
         proposals: those of them to be refined.
         executor: of a thread for the grids' neighbours, while those of the keypoints are sought in this one.
     """
@@ -111,9 +111,9 @@ def refine_scan(
 def grid_neighbors(
     keypoints: NDArray[np.float32], boxes: NDArray[np.float32], settings: GridSettings, vector_cells: int = 0
 ) -> GridNeighbors:
-    """What RoI-grid pooling aggregates (PV-RCNN, section 3.3), for boxes (R, 7) among keypoints (K, 3), metres.
+    """Return the neighbors for RoI-grid pooling (PV-RCNN, section 3.3) of boxes (R, 7) among keypoints (K, 3), metres.
 
-    Balls, or with `vector_cells` along each axis the cells of cubes whose half length is the radius.
+    These are balls, or with `vector_cells` along each axis the cells of cubes whose half length is the radius.
     """
     points = np.ascontiguousarray(roi_grid_points(boxes, settings.grid_size).reshape(-1, 3), np.float32)
     return GridNeighbors(
@@ -128,9 +128,9 @@ def grid_neighbors(
 
 
 def roi_features(proposals: Detections) -> NDArray[np.float32]:
-    """What pooling does not tell of a proposal: class (one of them 1), logit of its score, length, width, height.
+    """Return RoI features: class (one-hot), logit of the score, length, width, height.
 
-    (R, classes + ROI_FEATURES). One head serves all classes, which differ in what a good box looks like.
+    Shape (R, classes + ROI_FEATURES). One head serves all classes, whose boxes differ.
     """
     classes = np.eye(len(proposals.class_names), dtype=np.float32)[proposals.labels]
     score = np.clip(proposals.scores, 1e-4, 1 - 1e-4)[:, None]
@@ -138,7 +138,7 @@ def roi_features(proposals: Detections) -> NDArray[np.float32]:
 
 
 def _keypoint_margin_m(keypoints: NDArray[np.float32], boxes: NDArray[np.float32]) -> float:
-    """How far a keypoint stands from the circle around the nearest box, at most."""
+    """Return the largest distance of a keypoint from the circle around the nearest box, at least 0."""
     if not len(keypoints) or not len(boxes):
         return 0.0
     reach = np.hypot(boxes[:, 3], boxes[:, 4]) / 2

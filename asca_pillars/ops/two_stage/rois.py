@@ -14,7 +14,7 @@ from asca_pillars.geometry.overlap import iou_3d
 
 
 def to_box_frames(points: NDArray[np.floating[Any]], boxes: NDArray[np.floating[Any]]) -> NDArray[np.floating[Any]]:
-    """Points of each box, LiDAR frame -> the box's own: (R, P, 3), (R, 7) -> (R, P, 3)."""
+    """Transform points of each box from the LiDAR frame to the box's own: (R, P, 3), (R, 7) -> (R, P, 3)."""
     return _turned(points - boxes[:, None, :3], -boxes[:, 6])
 
 
@@ -24,7 +24,7 @@ def from_box_frames(points: NDArray[np.floating[Any]], boxes: NDArray[np.floatin
 
 
 def boxes_in_frames(boxes: NDArray[np.floating[Any]], frames: NDArray[np.floating[Any]]) -> NDArray[np.floating[Any]]:
-    """boxes[k] as seen from the box frames[k]: (R, 7), (R, 7) -> (R, 7), metres, yaw in radians, [-pi, pi)."""
+    """Return boxes[k] as seen from the box frames[k]: (R, 7), (R, 7) -> (R, 7), metres, yaw in radians, [-pi, pi)."""
     position = to_box_frames(boxes[:, None, :3], frames)[:, 0]
     return np.concatenate([position, boxes[:, 3:6], wrap_angle(boxes[:, 6:] - frames[:, 6:])], axis=1)
 
@@ -36,26 +36,26 @@ def boxes_from_frames(boxes: NDArray[np.floating[Any]], frames: NDArray[np.float
 
 
 def roi_grid_points(boxes: NDArray[np.floating[Any]], size: int) -> NDArray[np.floating[Any]]:
-    """Centers of size^3 cells of each box, LiDAR frame: (R, 7) -> (R, size^3, 3); z varies fastest, x slowest.
+    """Return centers of size^3 cells of each box, LiDAR frame: (R, 7) -> (R, size^3, 3); z varies fastest, x slowest.
 
-    What RoI-grid pooling looks around (PV-RCNN, section 3.3).
+    These are the grid points of RoI-grid pooling (PV-RCNN, section 3.3).
     """
     share = (np.indices((size, size, size)).reshape(3, -1).T + 0.5) / size - 0.5
     return from_box_frames(share.astype(boxes.dtype)[None] * boxes[:, None, 3:6], boxes)
 
 
 def _turned(points: NDArray[np.floating[Any]], yaw_rad: NDArray[np.floating[Any]]) -> NDArray[np.floating[Any]]:
-    """(R, P, 3) turned about z by (R,)."""
+    """Rotate (R, P, 3) about z by (R,)."""
     cos, sin = np.cos(yaw_rad)[:, None], np.sin(yaw_rad)[:, None]
     x, y, z = points[..., 0], points[..., 1], points[..., 2]
     return np.stack([cos * x - sin * y, sin * x + cos * y, z], axis=-1)
 
 
 def encode_refinement(boxes: NDArray[np.floating[Any]], proposals: NDArray[np.floating[Any]]) -> NDArray[np.float32]:
-    """Residuals of boxes[k] against proposals[k], metres and radians: (R, 7), (R, 7) -> (R, 7) float32.
+    """Encode boxes[k] as residuals to proposals[k], metres and radians: (R, 7), (R, 7) -> (R, 7) float32.
 
     As an anchor's (`encode_boxes`), the proposal moved to the origin being the anchor; the heading difference lies in
-    [-pi/2, pi/2), because refinement leaves it to the proposal which end is the front.
+    [-pi/2, pi/2), because the direction of the heading is the proposal's.
     """
     frames = proposals.astype(np.float64)
     seen = boxes_in_frames(boxes.astype(np.float64), frames)
@@ -82,18 +82,18 @@ def _at_origin(boxes: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 FOREGROUND_IOU = 0.55
-"""From this overlap in 3D on a proposal is drawn as foreground, and above it learns its residuals."""
+"""3D IoU from which a proposal is sampled as foreground, and above which it learns residuals."""
 HARD_IOU = 0.1
-"""Background from this overlap on is hard, below it easy."""
+"""3D IoU from which background is hard; below it is easy."""
 _FOREGROUND_SHARE = 0.5
-_HARD_SHARE = 0.8  # of the background
+_HARD_SHARE = 0.8  # share of hard samples in the background
 _BORDER_M = 0.1  # around a box, in which a keypoint is neither inside nor outside
 _CONFIDENCE_IOU = 0.25, 0.75  # where the confidence begins to rise from 0, and where it reaches 1
 
 
 @dataclass(frozen=True)
 class Overlaps:
-    """How proposals lie over the labelled boxes of their frame."""
+    """Overlaps of proposals with the labelled boxes of their frame."""
 
     iou: NDArray[np.float64]
     """(R,) largest 3D IoU with a box of the proposal's own class; 0 without any."""
@@ -105,7 +105,7 @@ class Overlaps:
 
 @dataclass(frozen=True)
 class RoiTargets:
-    """What to say of S sampled proposals."""
+    """Training targets of S sampled proposals."""
 
     rois: NDArray[np.int64]
     """(S,) rows of the proposals, some perhaps more than once."""
@@ -120,7 +120,7 @@ class RoiTargets:
 
 
 def match_proposals(proposals: Detections, boxes: NDArray[np.float32], labels: NDArray[np.int64]) -> Overlaps:
-    """3D IoU of proposals with labelled boxes (N, 7), LiDAR frame, of classes (N,), or IGNORED."""
+    """Match proposals with labelled boxes (N, 7), LiDAR frame, of classes (N,) or IGNORED, by 3D IoU."""
     iou = iou_3d(proposals.boxes, boxes)
     own = np.where(proposals.labels[:, None] == labels[None], iou, 0.0)
     other = np.where(labels[None] == IGNORED, iou, 0.0).max(axis=1, initial=0.0)
@@ -130,7 +130,7 @@ def match_proposals(proposals: Detections, boxes: NDArray[np.float32], labels: N
 
 
 def sample_rois(overlaps: Overlaps, count: int, rng: np.random.Generator) -> NDArray[np.int64]:
-    """Rows (count,) of proposals to learn from; fewer, namely none, only if there are none that are not ignored.
+    """Sample rows (count,) of proposals for training; none if all of them are ignored.
 
     At most half is foreground, each once. The rest is background, drawn with replacement, 80 % of it hard; where a
     kind is missing the others take its place, and without any background the foreground is drawn with replacement.
@@ -151,7 +151,7 @@ def sample_rois(overlaps: Overlaps, count: int, rng: np.random.Generator) -> NDA
 def roi_targets(
     proposals: Detections, boxes: NDArray[np.float32], overlaps: Overlaps, rois: NDArray[np.int64]
 ) -> RoiTargets:
-    """What to say of the proposals `rois` (S,), whose `overlaps` are with `boxes` (N, 7)."""
+    """Return the targets of the proposals `rois` (S,), whose `overlaps` are with `boxes` (N, 7)."""
     low, high = _CONFIDENCE_IOU
     iou = overlaps.iou[rois]
     positive = iou > FOREGROUND_IOU
@@ -170,9 +170,9 @@ def roi_targets(
 def keypoint_states(
     keypoints: NDArray[np.float32], boxes: NDArray[np.float32], labels: NDArray[np.int64]
 ) -> NDArray[np.int8]:
-    """1 for keypoints in a labelled box, 0 outside of all, -1 without part: (K, 3), (N, 7), (N,) -> (K,).
+    """Return 1 for keypoints in a labelled box, 0 outside, -1 if ignored: (K, 3), (N, 7), (N,) -> (K,).
 
-    No part take those within 0.1 m of a box's faces outside (PV-RCNN, section 3.3) and those in or at an IGNORED box.
+    Ignored are those within 0.1 m outside a box's faces (PV-RCNN, section 3.3), and those in or at an IGNORED box.
     """
     inside, near = points_in_boxes(keypoints, boxes), points_in_boxes(keypoints, boxes, _BORDER_M)
     in_object = (inside & (labels != IGNORED)).any(axis=1)

@@ -1,4 +1,4 @@
-"""How fast the detector is and why: stage by stage, against another, against the machine, in a new process."""
+"""Benchmarks: time per stage, comparison with another detector and with the machine, cold start."""
 
 from asca_deploy.benchmark.bench_report import BenchmarkReport, benchmark
 from asca_deploy.benchmark.cold import ColdStart, cold_start

@@ -1,4 +1,4 @@
-"""Where the milliseconds go, stage by stage, and on what; warm frames apart from the cold first one."""
+"""Time per stage, and the hardware it was measured on; warm frames apart from the cold first one."""
 
 import hashlib
 from collections.abc import Sequence
@@ -24,22 +24,22 @@ class BenchmarkReport:
     total_ms: Percentiles
     stages_ms: dict[str, Percentiles]
     outside_ms: Percentiles
-    """What is not spent in the graphs: input check, pillars, scatter, decoding and suppression."""
+    """Time outside the graphs: input check, pillars, scatter, decoding and suppression."""
     outside_share: float
     """Median over frames of outside / total."""
     cold_ms: float
     """The first scan, a fresh detector's very first one."""
     load_s: float
-    """Opening the bundle: checksums, sessions, canvas."""
+    """Time to open the bundle: checksums, sessions, canvas."""
     frames: int
     """Measured warm frames."""
     passes: int
-    """Of the network for each frame."""
+    """Passes of the network for each frame."""
     scans: int
     points: tuple[int, ...]
     """Points of each scan."""
     points_inside: tuple[int, ...]
-    """Of them those within the model's ranges, added up over the passes."""
+    """Points of each scan within the model's ranges, summed over the passes."""
     pillars: tuple[int, ...]
     """Pillars of each scan after the limits, the mean of the passes."""
     detections: tuple[int, ...]
@@ -51,7 +51,7 @@ class BenchmarkReport:
     threads: int
     cpu: str
     peak_memory_mib: float | None
-    """Largest resident memory of the process so far; None where the system does not say."""
+    """Largest resident memory of the process so far; None if the system does not report it."""
     versions: dict[str, str]
     bundle: str
     graphs_sha256: dict[str, str]
@@ -63,7 +63,7 @@ class BenchmarkReport:
     """Share of the measured frames that took longer than the deadline."""
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values for JSON."""
+        """Return plain values for JSON."""
         return asdict(self)
 
 

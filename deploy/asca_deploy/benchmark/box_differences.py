@@ -1,4 +1,4 @@
-"""How far the boxes of two detectors are apart."""
+"""Differences between the boxes of two detectors."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ class BoxDifference:
     lone: int
     """Boxes of either side without one of the other within SAME_OBJECT_M."""
     center_size_m: float
-    """Of a coordinate, length, width or height."""
+    """Largest difference of a center coordinate, length, width or height."""
     score: float
 
 

@@ -1,4 +1,4 @@
-"""What a new process costs: time to the first boxes, and the memory of `asca detect`."""
+"""Cost of a new process: time to the first boxes, and the memory of `asca detect`."""
 
 import json
 import subprocess
@@ -45,15 +45,15 @@ class ColdStart:
     """Medians over new processes; files are in the system's cache, compiled functions in theirs."""
 
     first_boxes_s: float
-    """From the start of Python to the boxes of one scan."""
+    """Time from the start of Python to the boxes of one scan."""
     import_s: float
-    """Of these, start of Python and imports."""
+    """Part of it: start of Python and imports."""
     load_s: float
-    """Of these, opening the bundle."""
+    """Part of it: opening the bundle."""
     first_scan_s: float
-    """Of these, the first scan."""
+    """Part of it: the first scan."""
     detect_peak_memory_mib: float | None
-    """Largest resident memory of `asca detect` on that scan, pictures and all; None where the system does not say."""
+    """Largest resident memory of `asca detect` on that scan, with pictures; None if the system does not report it."""
     repeats: int
 
 
@@ -66,7 +66,7 @@ def cold_start(
     """Start new processes that do with `scan` (N, 4), LiDAR frame, what `detector` would.
 
     Raises:
-        AscaError: a process failed; says how.
+        AscaError: a process failed; the message says how.
     """
     bundle = detector.folder
     options = {"provider": detector.provider, "precision": detector.precision, "threads": detector.threads}
@@ -84,7 +84,7 @@ def cold_start(
 
 
 def _mounting_options(mounting: Mounting, folder: Path) -> list[str]:
-    """The same for `asca detect`, which takes a pose from a file: one in `folder`."""
+    """Return the mounting as options of `asca detect`, which reads a pose from a file: one in `folder`."""
     options = [] if mounting.sensor_height_m is None else ["--sensor-height", str(mounting.sensor_height_m)]
     if mounting.pose is None:
         return [*options, "--axes", mounting.axes]

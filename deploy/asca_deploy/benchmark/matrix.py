@@ -1,4 +1,4 @@
-"""Every way of running a bundle on this machine, side by side: providers, precisions, threads."""
+"""Comparison of providers, precisions and threads for a bundle on this machine."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -39,7 +39,7 @@ class MatrixRow:
     boxes: BoxDifference | None
     """Against the reference's boxes, over all scans."""
     reason: str | None
-    """Why it cannot run here; None if it can."""
+    """Reason why it cannot run here; None if it can."""
 
 
 def measure_matrix(
@@ -56,13 +56,13 @@ def measure_matrix(
         bundles: folders by name. The first one's default on the CPU is the reference and the first row.
         scans: (N, 4) each, LiDAR frame.
         mounting: of their sensor.
-        threads: beside one alone; None for the physical cores granted to the process.
+        threads: compared with a single one; None for the physical cores granted to the process.
     """
     opened: dict[Way, Detector | str] = {}
     ways = [way for bundle in bundles for way in _ways(bundle, default_threads() if threads is None else threads)]
     for number in track(len(ways), "opening"):
         way = ways[number]
-        # What does not run with so many threads does not with others, and is one row.
+        # A way that fails with these threads fails with others too, and gets one row.
         if not any(isinstance(result, str) and _same_but_threads(way, other) for other, result in opened.items()):
             opened[way] = _open(bundles[way.bundle], way, scans[0], mounting)
     detectors = {str(way): detector for way, detector in opened.items() if isinstance(detector, Detector)}
@@ -87,12 +87,12 @@ def _ways(bundle: str, most: int) -> list[Way]:
 
 
 def _same_but_threads(way: Way, failed: Way) -> bool:
-    """Whether `way` would fail for the same reason; another precision might not."""
+    """Return whether `way` would fail for the same reason; another precision might not."""
     return way[:3] == failed[:3]
 
 
 def _open(folder: Path, way: Way, scan: NDArray[np.float32], mounting: Mounting | None) -> Detector | str:
-    """The detector, after its first scan, or why there is none."""
+    """Return the detector after its first scan, or why it cannot be opened."""
     try:
         detector = Detector(
             folder, provider=way.provider, precision=way.precision, threads=way.threads, mounting=mounting

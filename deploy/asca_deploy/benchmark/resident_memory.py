@@ -1,4 +1,4 @@
-"""How much memory the process holds."""
+"""Memory of the process."""
 
 import sys
 from pathlib import Path
@@ -7,10 +7,10 @@ STATUS = Path("/proc/self/status")
 
 
 def peak_memory_mib() -> float | None:
-    """Largest resident memory of the process so far; None where the system does not say.
+    """Return the largest resident memory of the process so far; None if the system does not report it.
 
-    Linux keeps the figure of getrusage across exec, so that a small program started by a large one looks large;
-    its own /proc does not.
+    Linux keeps the figure of getrusage across exec, which is too large for a small program started by a large one;
+    /proc is correct.
     """
     if (peak := _status_mib("VmHWM")) is not None:
         return peak
@@ -23,7 +23,7 @@ def peak_memory_mib() -> float | None:
 
 
 def resident_mib() -> float | None:
-    """Resident memory of the process now; None where the system does not say."""
+    """Return the resident memory of the process now; None if the system does not report it."""
     return _status_mib("VmRSS")
 
 

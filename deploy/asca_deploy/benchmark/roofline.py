@@ -1,4 +1,4 @@
-"""How much of what the machine can compute the backbone gets out of it.
+"""Roofline of the backbone: its share of the arithmetic throughput of the machine.
 
 The ceiling is measured, not looked up: a product of two large matrices by onnxruntime's CPU provider with the same
 number of threads, one of them constant as a network's weights are. gemm_*.onnx come from benchmarks/gemm_graphs.py.
@@ -21,16 +21,16 @@ RUNS, BUDGET_S = 7, 0.6  # per type: the median of so many, or of as many as the
 
 @dataclass(frozen=True)
 class Roofline:
-    """The backbone beside the machine's rate of multiplying matrices."""
+    """Rate of the backbone against the machine's rate of multiplying matrices."""
 
     gmac: float
     """Multiply-accumulates of the backbone, 1e9."""
     achieved_gmac_s: float
-    """Of neck and head at their p50, of one pass."""
+    """Rate of neck and head at their p50, for one pass."""
     gemm_gmac_s: dict[str, float]
     """Measured rate by type, float32 and int8."""
     type: str
-    """In which the bundle's backbone multiplies."""
+    """Type in which the bundle's backbone multiplies."""
     share: float
     """achieved / measured rate of that type. A provider that computes in less precision can exceed 1."""
     threads: int
@@ -49,7 +49,7 @@ def measure_roofline(bundle: Bundle, backbone_ms: float, threads: int) -> Roofli
 
 
 def gemm_rate(kind: str, threads: int, rows: int = SIZE) -> float:
-    """Multiply-accumulates per second, 1e9, of (rows, SIZE) @ (SIZE, SIZE) in onnxruntime: a median.
+    """Measure multiply-accumulates per second, 1e9, of (rows, SIZE) @ (SIZE, SIZE) in onnxruntime: a median.
 
     Args:
         kind: "float32", or "int8" for uint8 x int8 -> int32.

@@ -1,4 +1,4 @@
-"""How the time of each stage grows with the number of points."""
+"""Time of each stage as a function of the number of points."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ from asca_deploy.benchmark.timing import Track, pillars_of, run_frame, silently
 from asca_deploy.detector import Detector
 
 COUNTS = (1_000, 10_000, 100_000, 1_000_000)
-JITTER_M = 0.02  # what a LiDAR's own noise is like
+JITTER_M = 0.02  # similar to a LiDAR's range noise
 
 
 @dataclass(frozen=True)
@@ -19,7 +19,7 @@ class ScalingRow:
 
     points: int
     pillars: int
-    """After the limits, the mean of the passes."""
+    """Pillars after the limits, the mean of the passes."""
     stages_ms: dict[str, float]
     """p50 of each stage."""
     total_ms: float
@@ -50,7 +50,7 @@ def measure_scaling(
 
 
 def resample(scan: NDArray[np.float32], count: int) -> NDArray[np.float32]:
-    """`count` points of a scan (N, 4) in random order; beyond N, points again with a sensor's noise on x, y, z.
+    """Return `count` points of a scan (N, 4) in random order; beyond N, points again with a sensor's noise on x, y, z.
 
     Raises:
         ValueError: the scan has no point.

@@ -1,4 +1,4 @@
-"""Which of several is faster, and by how much: turn by turn, so that a busy machine is busy for all of them alike."""
+"""Speed of several detectors in alternation, so that a busy machine slows all of them alike."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -25,7 +25,7 @@ class Contestant:
     fps: float
     """1 / p50."""
     speedup: Spread
-    """How many times as fast as the first one: ratio of the two medians of a round, over the rounds."""
+    """Speed relative to the first one: ratio of the two medians of a round, over the rounds."""
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class Comparison:
 
     rounds: int
     contestants: tuple[Contestant, ...]
-    """As they were given; the first is what the others are measured against."""
+    """Contestants as they were given; the first one is the reference."""
 
 
 def compare(
@@ -61,7 +61,7 @@ def compare(
 def alternate(
     runs: Mapping[str, Run], scans: Sequence[NDArray[np.float32]], rounds: int, track: Track = silently
 ) -> dict[str, NDArray[np.float64]]:
-    """Wall times of several detectors that take turns, never two at a time.
+    """Return the wall times of several detectors that take turns, never two at a time.
 
     Args:
         runs: by name; called with a scan.

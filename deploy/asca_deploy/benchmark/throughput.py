@@ -1,4 +1,4 @@
-"""What `Detector.stream` gains in scans per second, and what that costs a single scan in latency."""
+"""Scans per second of `Detector.stream`, and its latency for a single scan."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from asca_deploy.benchmark.timing import Percentiles, Spread, Track, run_frame, silently
 from asca_deploy.detector import Detector
 
-FRAMES = 8  # of one round, at least
+FRAMES = 8  # minimum of a round
 
 
 @dataclass(frozen=True)
@@ -20,7 +20,7 @@ class Throughput:
 
     single_latency_ms: Percentiles
     stream_latency_ms: Percentiles
-    """From the points to the boxes, waiting for the scan before included."""
+    """Time from the points to the boxes, including the wait for the scan before."""
     single_fps: float
     """Scans per second that are finished, median over the rounds."""
     stream_fps: float

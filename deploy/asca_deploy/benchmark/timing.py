@@ -1,4 +1,4 @@
-"""What every table of the benchmark is made of: percentiles of frames, spreads of ratios, rounds that show progress."""
+"""Statistics of the benchmarks: percentiles of frames, spreads of ratios, rounds with a progress bar."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -12,11 +12,11 @@ from asca_pillars.detection.detections import FrameReport
 from asca_pillars.ops.pillar.prepare import PillarCounts
 
 Track: TypeAlias = Callable[[int, str], Iterable[int]]
-"""Numbers 0..count-1 of what is being done, in words; a command line puts a progress bar behind it."""
+"""Yields 0..count-1 for a named task; a command line shows a progress bar for it."""
 
 
 def silently(count: int, what: str) -> Iterable[int]:
-    """The Track that shows nothing."""
+    """Track without showing progress."""
     return range(count)
 
 
@@ -32,7 +32,7 @@ class Percentiles:
 
     @classmethod
     def of(cls, times_ms: list[float] | NDArray[np.float64]) -> "Percentiles":
-        """Of times (F,), or (R, F) of R rounds, in ms, over all of them."""
+        """Return the percentiles of times (F,), or (R, F) of R rounds, in ms, over all of them."""
         return cls(*(float(np.percentile(times_ms, q)) for q in (50, 95, 99, 100, 0)))
 
 
@@ -46,7 +46,7 @@ class Spread:
 
     @classmethod
     def of(cls, ratios: list[float] | NDArray[np.float64]) -> "Spread":
-        """Of unitless ratios (rounds,)."""
+        """Return the spread of unitless ratios (rounds,)."""
         return cls(*(float(np.percentile(ratios, q)) for q in (50, 25, 75)))
 
 
@@ -56,5 +56,5 @@ def run_frame(detector: Detector, scan: NDArray[Any]) -> FrameReport:
 
 
 def pillars_of(frame: FrameReport) -> int:
-    """Pillars of a scan after the limits, the mean of its passes; 0 where the family has none."""
+    """Return a scan's pillars after the limits, the mean of its passes; 0 where the family has none."""
     return round(frame.counts.pillars / frame.passes) if isinstance(frame.counts, PillarCounts) else 0

@@ -1,4 +1,4 @@
-"""What the pillar family's second graph is to its pipeline, with a dense neck and with a sparse one."""
+"""Interface of the pillar family's backbone graph, with a dense neck and with a sparse one."""
 
 from typing import Any, NamedTuple, Protocol, TypeAlias
 
@@ -12,10 +12,10 @@ Maps: TypeAlias = HeadMaps[NDArray[np.float32]]
 
 
 class HeadAnswer(NamedTuple):
-    """What the head says of one scan, as `decode` takes it."""
+    """Outputs of the head for one scan, as `decode` takes them."""
 
     maps: Maps
-    """On the head's map, or in rows of its active cells."""
+    """Head maps, or rows of the head's active cells."""
     cells: NDArray[np.int32] | None
     """(M,) flat index of the head cell of each row; None of maps."""
 
@@ -25,13 +25,13 @@ class PillarBackbone(Protocol):
 
     @property
     def stage(self) -> str:
-        """What `place` is called in reports."""
+        """Name of the stage `place` in reports."""
 
     def place(self, pillar_features: NDArray[Any], cells: NDArray[np.int64]) -> Any:
-        """Pillar features (P, C), in the bundle's type, and flat indices (P,) of their cells -> the graph's input."""
+        """Place pillar features (P, C), in the bundle's type, at flat cell indices (P,): the graph's input."""
 
     def run(self, placed: Any) -> HeadAnswer:
         """Run the graph; each placed scan may be given once."""
 
     def infer_with_neck(self, placed: Any) -> FirstPass:
-        """As `run`, and the head's input; for graphs that a second stage follows."""
+        """Run the graph as `run` does, and return the head's input too; for graphs that a second stage follows."""

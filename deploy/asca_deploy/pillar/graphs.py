@@ -1,4 +1,4 @@
-"""The graphs of a pillar bundle: what they take and give, by name, and how they are opened."""
+"""Inputs and outputs of the graphs of a pillar bundle, by name, and how they are opened."""
 
 from pathlib import Path
 
@@ -11,7 +11,7 @@ from asca_pillars.ops.pillar.neck_rulebooks import LEVELS, SAME
 from asca_pillars.ops.pillar.prepare import FEATURES
 
 PILLAR_FEATURES = "pillar_features"
-"""What encoder.onnx gives; the backbone of a sparse neck takes it under the same name."""
+"""Output of encoder.onnx; the backbone of a sparse neck takes it under the same name."""
 
 _NO_SPARSE_NECK = {
     "openvino": "it needs outputs of fixed shapes",
@@ -21,11 +21,11 @@ _DENSE_FORMS = {
     "pillar": ", or what `asca export SOURCE --dense-neck` writes of the checkpoint, or of asca_sim",
     "pillar_refine": "",
 }
-"""Of each kind, which bundles besides."""
+"""End of the error message by kind: other bundles that do run."""
 
 
 def encoder_interface(bundle: PillarBundle) -> Interface:
-    """Of encoder.onnx: features of M points in P pillars -> features of the pillars."""
+    """Return the interface of encoder.onnx: features of M points in P pillars -> features of the pillars."""
     inputs = {
         "features": Tensor("float32", (None, len(FEATURES))),
         "pillar_index": Tensor("int64", (None,)),
@@ -35,7 +35,7 @@ def encoder_interface(bundle: PillarBundle) -> Interface:
 
 
 def output_channels(bundle: PillarBundle, neck_channels: int = 0) -> dict[str, int]:
-    """Of backbone.onnx; with `neck_channels` also those of NECK."""
+    """Return the channels of backbone.onnx's outputs; with `neck_channels` also those of NECK."""
     anchors = bundle.spec.anchors.shape[2]
     counts = (bundle.spec.scores_per_anchor * anchors, 7 * anchors, 2 * anchors)
     channels = dict(zip(HeadMaps._fields, counts, strict=True))
@@ -43,7 +43,7 @@ def output_channels(bundle: PillarBundle, neck_channels: int = 0) -> dict[str, i
 
 
 def backbone_interface(bundle: PillarBundle, neck_channels: int = 0, neck_type: str = "float32") -> Interface:
-    """Of backbone.onnx: a pseudo-image -> maps, channels last; with a sparse neck rows and tables -> rows.
+    """Return the interface of backbone.onnx: pseudo-image -> channels-last maps, or for a sparse neck rows -> rows.
 
     NECK is float32, or the uint8 steps of an 8-bit neck, which refine.onnx scales: `neck_type`.
     """
@@ -66,7 +66,7 @@ def open_encoder(folder: Path, bundle: PillarBundle) -> Session:
     """Open encoder.onnx of the bundle in this folder, on the CPU.
 
     Raises:
-        BundleError: the graph cannot be run or is not what the manifest says.
+        BundleError: the graph cannot be run or does not match the manifest.
     """
     # One thread: the maximum over a pillar's points is a ScatterND with repeated indices, and onnxruntime's threads
     # race for them: now and then a few features come out too small (onnxruntime issue 18048; seen with 1.31). It is

@@ -42,7 +42,7 @@ class PillarPipeline:
         provider, precision, threads: of the backbone.
 
     Raises:
-        BundleError: a graph cannot be run or is not what the manifest says.
+        BundleError: a graph cannot be run or does not match the manifest.
         ProviderError: the provider does not start, or cannot run this backbone.
     """
 
@@ -66,7 +66,7 @@ class PillarPipeline:
         self._anchors = self.spec.anchors
 
     def prepare(self, points: NDArray[np.float32], laps: Laps) -> PreparedPillars:
-        """Points (N, 4), metres, LiDAR frame, and reflectance -> the input of the backbone."""
+        """Prepare the backbone's input from points (N, 4), metres, LiDAR frame, and reflectance."""
         pillars = self.pillarize(points)
         laps.append(("pillarize", perf_counter()))
         features = self.encode(pillars)
@@ -76,24 +76,24 @@ class PillarPipeline:
         return PreparedPillars(placed, pillars.stats)
 
     def infer(self, prepared: PreparedPillars, laps: Laps) -> HeadAnswer:
-        """The placed pillars -> head maps (channels, H, W) of logits and residuals, or rows of the active cells."""
+        """Run the backbone: head maps (channels, H, W) of logits and residuals, or rows of the active cells."""
         answer = self.backbone.run(prepared.placed)
         laps.append(("neck+head", perf_counter()))
         return answer
 
     def finish(self, raw: HeadAnswer, laps: Laps) -> Detections:
-        """Head maps (channels, H, W) -> boxes, LiDAR frame, above the score threshold that the rotated NMS keeps."""
+        """Decode head maps (channels, H, W) into boxes, LiDAR frame, by score thresholds and rotated NMS."""
         spec = self.spec
         detections = decode(raw.maps, self._anchors, spec.classes, spec.post, raw.cells, spec.direction_offset_rad)
         laps.append(("decode", perf_counter()))
         return detections
 
     def pillarize(self, points: NDArray[np.float32]) -> Pillars:
-        """Finite points (N, 4), metres, LiDAR frame -> the features of M points in P pillars. Paper section 3.2."""
+        """Sort finite points (N, 4), metres, LiDAR frame, into P pillars: features of M points. Paper section 3.2."""
         return pillarize(points, self.spec.grid, self.spec.limits)
 
     def encode(self, pillars: Pillars) -> NDArray[Any]:
-        """Features (M, 9) -> unitless pillar features (P, C), of the canvas's type. Paper section 3.2."""
+        """Encode features (M, 9) -> unitless pillar features (P, C), of the canvas's type. Paper section 3.2."""
         if not len(pillars.cells):
             return np.empty((0, self.bundle.pillar.channels), self.bundle.pillar.canvas.type)
         values = {name: getattr(pillars, name) for name in self._encoder.inputs}  # a graph may not need all three
@@ -111,7 +111,7 @@ def open_backbone(
     """Open backbone.onnx of a dense or of a sparse neck; with `neck_channels` it has the output NECK.
 
     Raises:
-        BundleError: the graph cannot be run or is not what the manifest says.
+        BundleError: the graph cannot be run or does not match the manifest.
         ProviderError: the provider does not start, or cannot run a sparse neck.
     """
     check_neck(bundle, provider)
@@ -180,7 +180,7 @@ class CanvasBackbone:
         self._free = [self.new_canvas()]
 
     def place(self, pillar_features: NDArray[Any], cells: NDArray[np.int64]) -> Canvas:
-        """Pillar features (P, C) at their cells, flat indices (P,), on a canvas that `run` gives back."""
+        """Place pillar features (P, C) at their cells, flat indices (P,), on a canvas that `run` gives back."""
         canvas = take_free(self._free, self.new_canvas)
         if self._pools:
             pillar_features, cells = pool_pillars(pillar_features, cells, self._bundle.spec.grid)
@@ -188,31 +188,31 @@ class CanvasBackbone:
         return canvas
 
     def run(self, placed: Canvas) -> HeadAnswer:
-        """The canvas -> logits and residuals on the head's map."""
+        """Run the graph on the canvas: logits and residuals on the head's map."""
         maps = self.neck_and_head(placed.image)
         self._free.append(placed)
         return HeadAnswer(maps, None)
 
     def infer_with_neck(self, placed: Canvas) -> FirstPass:
-        """As `run`, and the neck's map (H, W, C), which a second stage reads; for graphs with the output NECK."""
+        """Run the graph as `run` does, and return the neck's map (H, W, C) too; for graphs with the output NECK."""
         *maps, neck = self._session.run((*HeadMaps._fields, NECK), {"canvas": placed.image})
         self._free.append(placed)
         return FirstPass(channels_first(maps), neck[0])
 
     def new_canvas(self) -> Canvas:
-        """An empty canvas of this bundle's format."""
+        """Return an empty canvas of this bundle's format."""
         return Canvas(self._bundle.pillar.channels, self._bundle.spec.grid, self._bundle.pillar.canvas)
 
     def neck_and_head(self, canvas: NDArray[Any]) -> Maps:
-        """Pseudo-image (1, ny + 1, nx + 1, C) -> logits and residuals on the head's map. Paper Table 1."""
+        """Run the graph on the pseudo-image (1, ny + 1, nx + 1, C): logits and residuals. Paper Table 1."""
         return channels_first(self._session.run(HeadMaps._fields, {"canvas": canvas}))
 
 
 class PlacedPillars(NamedTuple):
-    """What the graph reads of one scan."""
+    """Inputs of the graph for one scan."""
 
     features: NDArray[Any]
-    """(P, C), of a pooled map (cells, C)"""
+    """(P, C), or (cells, C) with a pooled map."""
     tables: NeckRulebooks[NDArray[np.int32]]
 
 
@@ -236,7 +236,7 @@ class TableBackbone:
         self._free = [self._new_builder()]
 
     def place(self, pillar_features: NDArray[Any], cells: NDArray[np.int64]) -> PlacedPillars:
-        """Pillar features (P, C) with the tables that their cells, flat indices (P,), make."""
+        """Return pillar features (P, C) with the rulebooks of their cells, flat indices (P,)."""
         builder = take_free(self._free, self._new_builder)
         if self._pools:
             pillar_features, cells = pool_pillars(pillar_features, cells, self._bundle.spec.grid)
@@ -245,11 +245,11 @@ class TableBackbone:
         return PlacedPillars(pillar_features, tables)
 
     def run(self, placed: PlacedPillars) -> HeadAnswer:
-        """Scores (M, A), boxes (M, 7A), directions (M, 2A) at M active head cells."""
+        """Run the graph: scores (M, A), boxes (M, 7A), directions (M, 2A) at M active head cells."""
         return HeadAnswer(HeadMaps(*self._rows(placed, HeadMaps._fields)), placed.tables.head_cells)
 
     def infer_with_neck(self, placed: PlacedPillars) -> FirstPass:
-        """As `run`, and the head's input (M, C), which a second stage reads; for graphs with the output NECK."""
+        """Run the graph as `run` does, and return the head's input (M, C) too; for graphs with the output NECK."""
         *maps, neck = self._rows(placed, (*HeadMaps._fields, NECK))
         return FirstPass(HeadMaps(*maps), neck, placed.tables.head_cells)
 
@@ -266,12 +266,12 @@ class TableBackbone:
 
 
 def run_graph(session: Session, outputs: Sequence[str], given: Mapping[str, NDArray[Any]]) -> list[NDArray[Any]]:
-    """The outputs of these names; of what is given the graph takes the inputs that it has."""
+    """Run a graph for the outputs of these names; given inputs that it lacks are left out."""
     return session.run(outputs, {name: given[name] for name in session.inputs})
 
 
 def take_free(free: list[T], make: Callable[[], T]) -> T:
-    """One that is free, or a new one; appending it to `free` gives it back."""
+    """Return a free item, or a new one; appending it to `free` gives it back."""
     try:
         return free.pop()  # atomic, as append is: two threads never get the same one
     except IndexError:
@@ -279,7 +279,7 @@ def take_free(free: list[T], make: Callable[[], T]) -> T:
 
 
 def channels_first(channels_last: Sequence[NDArray[Any]]) -> HeadMaps[NDArray[np.float32]]:
-    """Head maps of one scan as a graph gives them, (1, H, W, C) each, as decoding reads them, (C, H, W) each."""
+    """Transpose head maps of one scan from a graph's (1, H, W, C) to (C, H, W) each."""
     return HeadMaps(*(maps[0].transpose(2, 0, 1) for maps in channels_last))
 
 

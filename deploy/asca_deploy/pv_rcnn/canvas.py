@@ -1,4 +1,4 @@
-"""The map seen from above that the voxels of the last level make."""
+"""Bird's-eye-view map of the voxels of the last level."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""What the graphs of a pv_rcnn bundle take and give, by name."""
+"""Inputs and outputs of the graphs of a pv_rcnn bundle, by name."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -14,25 +14,25 @@ from asca_pillars.ops.pv_rcnn.prepare import LEVEL_SOURCES, SourceBalls, VoxelSc
 from asca_pillars.ops.pv_rcnn.rulebooks import SUBMANIFOLD, VoxelLevel
 
 VOXEL_VALUES = 4
-"""Of a voxel that enter voxels.onnx: x, y, z, reflectance."""
+"""Values of a voxel that enter voxels.onnx: x, y, z, reflectance."""
 OUT = "out"
-"""Output of voxels.onnx: conv_out. The others have the names of sources."""
+"""Output of voxels.onnx for conv_out; the others have the names of sources."""
 
 _KEPT_BYTES = 64 << 20
 
 
 def map_channels(bundle: PvRcnnBundle) -> int:
-    """Channels of the map seen from above."""
+    """Return the channels of the bird's-eye-view map."""
     return bundle.pv_rcnn.voxel_channels[-1] * bundle.spec.level_shapes[-1][0]
 
 
 def map_type(bundle: PvRcnnBundle) -> str:
-    """NumPy's name of the map's type: of an 8-bit backbone whole steps, step 0 standing for 0."""
+    """Return NumPy's name of the map's type; an 8-bit backbone has whole steps, with step 0 for 0."""
     return "float32" if bundle.precision == "float32" else "uint8"
 
 
 def keeps_memory(section: PvRcnnSection) -> bool:
-    """Whether graphs keep the memory of a run for the next, judged by the largest gather, that of RoI-grid pooling.
+    """Return whether graphs keep the memory of a run for the next, by the size of RoI-grid pooling's gather.
 
     Kept, the published sizes take 2.0 GB for a whole scan, 0.8 GB otherwise, for 15 % more time. A small network saves
     that time.
@@ -43,7 +43,7 @@ def keeps_memory(section: PvRcnnSection) -> bool:
 
 
 def voxels_interface(bundle: PvRcnnBundle) -> Interface:
-    """Of voxels.onnx: the sparse backbone."""
+    """Return the interface of voxels.onnx: the sparse backbone."""
     inputs = {"features": Tensor("float32", (None, VOXEL_VALUES))}
     for number in range(len(LEVEL_SOURCES)):
         inputs[f"same_{number}"] = Tensor("int32", (None, SUBMANIFOLD.taps))
@@ -56,7 +56,7 @@ def voxels_interface(bundle: PvRcnnBundle) -> Interface:
 
 
 def backbone_interface(bundle: PvRcnnBundle) -> Interface:
-    """Of backbone.onnx: the backbone on the map, and the anchors' head."""
+    """Return the interface of backbone.onnx: the backbone on the map, and the anchor head."""
     rows, columns = bundle.spec.map_shape
     anchors, classes = bundle.spec.anchors.shape[2], len(bundle.spec.classes)
     return {"canvas": Tensor(map_type(bundle), (1, rows, columns, map_channels(bundle)))}, {
@@ -66,7 +66,7 @@ def backbone_interface(bundle: PvRcnnBundle) -> Interface:
 
 
 def keypoints_interface(bundle: PvRcnnBundle) -> Interface:
-    """Of keypoints.onnx: voxel set abstraction and keypoint weighting."""
+    """Return the interface of keypoints.onnx: voxel set abstraction and keypoint weighting."""
     channels = dict(zip(LEVEL_SOURCES, bundle.pv_rcnn.voxel_channels[:-1], strict=True))
     inputs = {
         "points": Tensor("float32", (None, 4)),
@@ -91,7 +91,7 @@ def keypoints_interface(bundle: PvRcnnBundle) -> Interface:
 
 
 def deform_interface(bundle: PvRcnnBundle) -> Interface:
-    """Of deform.onnx: around which places keypoints look at each deformed source."""
+    """Return the interface of deform.onnx: the shifted positions of keypoints for each deformed source."""
     channels = dict(zip(LEVEL_SOURCES, bundle.pv_rcnn.voxel_channels[:-1], strict=True))
     settings = bundle.pv_rcnn.settings
     inputs, outputs = {"keypoints": Tensor("float32", (None, 3))}, {}
@@ -109,7 +109,7 @@ def deform_interface(bundle: PvRcnnBundle) -> Interface:
 
 
 def refine_interface(bundle: PvRcnnBundle) -> Interface:
-    """Of refine.onnx: RoI-grid pooling and the heads of the second stage."""
+    """Return the interface of refine.onnx: RoI-grid pooling and the heads of the second stage."""
     settings = bundle.pv_rcnn.settings
     inputs = {
         "keypoints": Tensor("float32", (None, 3)),
@@ -123,7 +123,7 @@ def refine_interface(bundle: PvRcnnBundle) -> Interface:
 
 
 def voxel_inputs(features: NDArray[np.float32], levels: Sequence[VoxelLevel[NDArray[Any]]]) -> dict[str, NDArray[Any]]:
-    """What voxels.onnx takes of a scan with voxel features (N, 4), metres and reflectance."""
+    """Return the inputs of voxels.onnx for a scan with voxel features (N, 4), metres and reflectance."""
     same = {f"same_{number}": level.same for number, level in enumerate(levels[:-1])}
     strided = {f"strided_{number}": level.strided for number, level in enumerate(levels) if number}
     return {"features": features, **same, **strided}
@@ -136,7 +136,7 @@ def keypoint_inputs(
     bev: NDArray[np.float32],
     balls_of: Sequence[Sequence[NDArray[np.int32]]],
 ) -> dict[str, NDArray[Any]]:
-    """What keypoints.onnx takes: unitless features (N, C) of levels and (K, C) of the map at keypoints, and balls."""
+    """Return the inputs of keypoints.onnx: unitless features (N, C) of levels, (K, C) of the map, balls."""
     given: dict[str, NDArray[Any]] = {"points": scan.points, "keypoints": scan.keypoints, "bev": bev}
     for number, scale in enumerate(scan.scales):
         given |= {f"scale_{number}_{part}": array for part, array in scale._asdict().items()}
@@ -150,7 +150,7 @@ def keypoint_inputs(
 def deform_inputs(
     scan: VoxelScan, settings: VoxelSetSettings, levels: Mapping[str, NDArray[np.float32]]
 ) -> dict[str, NDArray[Any]]:
-    """What deform.onnx takes: unitless features (N, C) of levels by name, and what stands around the keypoints."""
+    """Return the inputs of deform.onnx: unitless features (N, C) of levels by name, and the keypoints' neighbors."""
     given: dict[str, NDArray[Any]] = {"keypoints": scan.keypoints}
     for number, each in enumerate(settings.sources):
         if each in settings.deformed:
@@ -164,7 +164,7 @@ def deform_inputs(
 def balls_around(
     scan: VoxelScan, settings: VoxelSetSettings, places: Mapping[str, NDArray[np.float32]]
 ) -> list[list[NDArray[np.int32]]]:
-    """Of each source and radius the indices (K, samples) that a keypoint aggregates, around places (K, 3), metres."""
+    """Return the ball indices (K, samples) of each source and radius around places (K, 3), metres."""
     balls = []
     for number, each in enumerate(settings.sources):
         count = settings.places(each)

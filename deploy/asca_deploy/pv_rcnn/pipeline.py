@@ -1,4 +1,4 @@
-"""The pipeline of kind pv_rcnn: voxels propose, keypoints refine (PV-RCNN, section 3)."""
+"""Pipeline of kind pv_rcnn: proposals from voxels, refinement by keypoints (PV-RCNN, section 3)."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -51,21 +51,21 @@ class PreparedVoxels(NamedTuple):
     levels: dict[str, NDArray[np.float32]]
     """Features (N, C) of the voxels of each level that keypoints aggregate, by the names of sources."""
     canvas: VoxelCanvas | None
-    """None of a scan without voxels."""
+    """None for a scan without voxels."""
 
     @property
     def counts(self) -> ScanCounts:
-        """What became of its points."""
+        """Counts of the scan's points."""
         return self.scan.counts
 
 
 class VoxelAnswer(NamedTuple):
-    """What the first stage says of a scan."""
+    """Outputs of the first stage for one scan."""
 
     scan: VoxelScan
     levels: dict[str, NDArray[np.float32]]
     bev: NDArray[np.float32]
-    """(K, C) the map seen from above at the keypoints, in steps where the map is."""
+    """(K, C) features of the bird's-eye-view map at the keypoints, in steps where the map is."""
     maps: HeadMaps[NDArray[np.float32]] | None
     """(channels, H, W); None of a scan without voxels."""
 
@@ -83,7 +83,7 @@ class PvRcnnPipeline:
         provider, precision, threads: of the backbone; the other graphs have as many threads.
 
     Raises:
-        BundleError: a graph cannot be run or is not what the manifest says.
+        BundleError: a graph cannot be run or does not match the manifest.
         ProviderError: the provider does not start.
     """
 
@@ -123,7 +123,7 @@ class PvRcnnPipeline:
         self._builders = [self.spec.rulebook_builder()]
 
     def prepare(self, points: NDArray[np.float32], laps: Laps) -> PreparedVoxels:
-        """Points (N, 4), metres, LiDAR frame, and reflectance -> the map seen from above."""
+        """Prepare the bird's-eye-view map from points (N, 4), metres, LiDAR frame, and reflectance."""
         voxelized = self.voxelize(points)
         laps.append(("voxelize", perf_counter()))
         scan = with_neighbors(points, voxelized, self.spec, self.settings)
@@ -138,7 +138,7 @@ class PvRcnnPipeline:
         return PreparedVoxels(scan, levels, canvas)
 
     def infer(self, prepared: PreparedVoxels, laps: Laps) -> VoxelAnswer:
-        """The map seen from above -> head maps, and what it says at the keypoints."""
+        """Run neck and head on the map; return the head maps, and the map's features at the keypoints."""
         scan, levels, canvas = prepared
         if canvas is None:
             return VoxelAnswer(scan, levels, np.empty((0, self._map_channels), np.float32), None)
@@ -150,7 +150,7 @@ class PvRcnnPipeline:
         return VoxelAnswer(scan, levels, bev, maps)
 
     def finish(self, raw: VoxelAnswer, laps: Laps) -> Detections:
-        """Head maps -> proposals -> refined boxes above the score threshold that survive the rotated NMS."""
+        """Decode proposals, refine them, and return the boxes that thresholds and rotated NMS keep."""
         if raw.maps is None:
             return Detections.empty(self.spec.class_names)
         detections = reported_detections(*self.judge(raw.maps, raw, laps), self.spec, self.scores)
@@ -160,7 +160,7 @@ class PvRcnnPipeline:
     def judge(
         self, maps: HeadMaps[NDArray[np.float32]], raw: VoxelAnswer, laps: Laps
     ) -> tuple[Detections, NDArray[np.float32], NDArray[np.float32]]:
-        """The R proposals of head maps, and what the second stage says of them: logits (R,), residuals (R, 7)."""
+        """Return the R proposals of head maps, and the second stage's logits (R,) and residuals (R, 7) for them."""
         proposals = propose_anchors(maps, self.spec, self.settings.proposals)
         laps.append(("propose", perf_counter()))
         places = self.deform(raw.scan, raw.levels)
@@ -176,14 +176,14 @@ class PvRcnnPipeline:
         return proposals, confidence, residuals
 
     def voxelize(self, points: NDArray[np.float32]) -> VoxelizedScan:
-        """Points (N, 4), metres, LiDAR frame, and reflectance -> what voxels.onnx reads."""
+        """Voxelize points (N, 4), metres, LiDAR frame, and reflectance: the input of voxels.onnx."""
         builder = take_free(self._builders, self.spec.rulebook_builder)
         voxelized = voxel_levels(points, self.spec, builder)
         self._builders.append(builder)
         return voxelized
 
     def encode(self, scan: VoxelScan | VoxelizedScan) -> dict[str, NDArray[Any]]:
-        """Unitless features (N, C) of the voxels of every level that is read, by name, see OUT; at least one voxel.
+        """Return unitless features (N, C) of the voxels of every level that is read, by name; at least one voxel.
 
         Those of OUT are whole steps where the map is.
         """
@@ -191,11 +191,11 @@ class PvRcnnPipeline:
         return dict(zip(names, run_graph(self._voxels, names, voxel_inputs(scan.features, scan.levels)), strict=True))
 
     def neck_and_head(self, canvas: NDArray[Any]) -> HeadMaps[NDArray[np.float32]]:
-        """The map (1, H, W, C) -> scores (A * classes, H, W), boxes (7A, H, W), directions (2A, H, W)."""
+        """Run neck and head on (1, H, W, C): scores (A * classes, H, W), boxes (7A, H, W), directions (2A, H, W)."""
         return channels_first(self._backbone.run(HeadMaps._fields, {"canvas": canvas}))
 
     def deform(self, scan: VoxelScan, levels: Mapping[str, NDArray[np.float32]]) -> dict[str, NDArray[np.float32]]:
-        """Around which places (K, 3), metres, keypoints look at levels with features (N, C); by name, none without."""
+        """Return shifted positions (K, 3), metres, for levels with features (N, C), by name; empty without shifts."""
         if self._deform is None:
             return {}
         names = list(self._deform.outputs)
@@ -209,7 +209,7 @@ class PvRcnnPipeline:
         places: Mapping[str, NDArray[np.float32]],
         balls: Sequence[Sequence[NDArray[np.int32]]],
     ) -> NDArray[np.float32]:
-        """Weighted unitless features (K, C) of the keypoints.
+        """Return weighted unitless features (K, C) of the keypoints.
 
         Args:
             scan: with the keypoints.
@@ -224,7 +224,7 @@ class PvRcnnPipeline:
     def refine(
         self, keypoints: NDArray[np.float32], features: NDArray[np.float32], grid: GridNeighbors
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Confidence logits (R,) and residuals (R, 7) of the proposals with this grid; keypoints (K, 3), metres."""
+        """Return confidence logits (R,) and residuals (R, 7) of the proposals with this grid; keypoints (K, 3)."""
         if not len(grid.points):
             return np.empty(0, np.float32), np.empty((0, 7), np.float32)
         grids = {f"grid_{number}": indices for number, indices in enumerate(grid.indices)}

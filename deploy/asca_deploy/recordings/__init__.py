@@ -1,1 +1,1 @@
-"""Recordings: detection scan by scan, and the files that are written of it."""
+"""Recordings: detection scan by scan, and the files with its results."""

@@ -1,4 +1,4 @@
-"""Detection in a recording: scans of one topic in, boxes with time stamps and identities out."""
+"""Detection in the scans of one topic of a recording: boxes with time stamps and identities."""
 
 import json
 from collections import Counter, deque
@@ -130,7 +130,7 @@ def detect_recording(
         options: which model runs, and how.
         reading: how the sensor was mounted.
         score: report detections from this score on, or by class; None: the thresholds of the model.
-        around: look in every direction, by turned passes.
+        around: detect in every direction, see `asca_deploy.around`.
         progress: called after each scan.
         remark: called with each of the result's `remarks` as soon as it is known.
 
@@ -233,7 +233,7 @@ class _Run:
         self.kept: list[DetectedScan] = []
 
     def results(self) -> Iterator[None]:
-        """One item for each scan that is in the journal now."""
+        """Yield one item for each scan that is in the journal now."""
         for found in self._detector.stream(self._points()):
             yield from self._skip()
             scan = self._coming.popleft()
@@ -253,11 +253,11 @@ class _Run:
         yield from self._skip()
 
     def first(self) -> str:
-        """The first reason why a scan was skipped, to end a sentence with."""
+        """Return the first reason why a scan was skipped, as the end of a sentence."""
         return f": {self.troubles[0]}" if self.troubles else ""
 
     def skipped(self) -> list[str]:
-        """A sentence, if scans were skipped."""
+        """Return a sentence on skipped scans, if there are any."""
         return [f"{len(self.troubles)} scans were skipped{self.first()}"] if self.troubles else []
 
     def _points(self) -> Iterator[NDArray[np.float32]]:
@@ -279,7 +279,7 @@ class _Run:
 
 
 def _check_times(times: Sequence[int], task: _Task, topic: str, poses: Poses | None, reporter: Reporter) -> None:
-    """Say that stamps are out of order or the odometry is too short; ScanError if it is of another time."""
+    """Report stamps out of order or too short odometry; ScanError if the odometry is of another time."""
     if stamps := said_of_stamps(times):
         reporter.remark(f"{task.path}, {topic}: {stamps}")
     if poses is None:
@@ -303,7 +303,7 @@ def _about(
     topic: str,
     least: ScoreThresholds | None,
 ) -> dict[str, Any]:
-    """All that detections depend on: a journal of anything else is not gone on with."""
+    """Return all that detections depend on; a journal is only resumed if it is the same."""
     files = recording_files(task.path)
     return {
         "recording": str(task.path),
@@ -316,13 +316,13 @@ def _about(
         **detector_scope(detector.spec, around=task.around).to_json(),
         "score": least,
         "around": task.around,
-        "mounting": to_dict(mounting),  # what the files that `reading` names had in them
+        "mounting": to_dict(mounting),  # content of the files that `reading` names
         "reading": {name: None if value is None else str(value) for name, value in asdict(reading).items()},
     }
 
 
 def _pose_of_scan(poses: Poses, mounting: Mounting, time_ns: int) -> NDArray[np.float64]:
-    """From the scan to the frame that stands still: the scan is turned to x forward, where the odometry's axes lie."""
+    """Return the pose of the scan, turned to x forward as the odometry's axes, in the fixed frame."""
     level = np.eye(4)
     level[:3, :3], level[:3, 3] = mounting.level.axes, mounting.level.shift_m
     return np.asarray(poses.at(time_ns) @ level)
@@ -331,7 +331,7 @@ def _pose_of_scan(poses: Poses, mounting: Mounting, time_ns: int) -> NDArray[np.
 def _with_points(
     results: Iterator[Found], scans: RecordedScans | None
 ) -> Iterator[tuple[Found, NDArray[np.float32] | None]]:
-    """Each result with the points of its scan, which is read once more; None without `scans`."""
+    """Yield each result with the points of its scan, which is read once more; None without `scans`."""
     again = iter(()) if scans is None else scans.read()
     for found in results:
         points = (one.scan.points for one in again if one.number == found.number and one.scan is not None)
@@ -346,7 +346,7 @@ def _write(
     about: dict[str, Any],
     opened: Callable[[ExitStack, ExitStack], list[ResultFile]],
 ) -> tuple[int, Counter[str]]:
-    """All files, none of which appears before all are complete; how many scans they hold, and boxes of each class."""
+    """Write all files, none of which appears before all are complete; return the counts of scans and boxes by class."""
     with ExitStack() as places, ExitStack() as handles:
         place = places.enter_context(atomic_path(task.out / ABOUT_FILE))
         place.write_text(json.dumps(about | {"tracks": task.track}, indent=1) + "\n", encoding="utf-8")

@@ -1,6 +1,6 @@
 """Boxes as an MCAP that Foxglove shows: `foxglove.SceneUpdate` in JSON, one message for each scan.
 
-Foxglove knows the schema by its name (docs.foxglove.dev, Message schemas); what stands here is the part that is used.
+Foxglove identifies the schema by its name (docs.foxglove.dev, Message schemas); the part that is used is defined here.
 Each message deletes the boxes of the scan before and adds its own, so that jumping in time shows one scan's boxes.
 Opened beside the recording, they lie in its 3D panel: frame and times are those of the scans.
 """
@@ -90,7 +90,7 @@ class FoxgloveFile:
         self._channel = self._writer.register_channel(TOPIC, "json", schema)
 
     def write(self, found: Found, points: NDArray[np.float32] | None = None) -> None:
-        """One message."""
+        """Write one message."""
         data = json.dumps(scene_update(found)).encode()
         self._writer.add_message(self._channel, found.time_ns, data, found.time_ns, found.number)
 
@@ -100,7 +100,7 @@ class FoxgloveFile:
 
 
 def scene_update(found: Found) -> dict[str, Any]:
-    """A scan's boxes as the fields of foxglove.SceneUpdate."""
+    """Return a scan's boxes as the fields of foxglove.SceneUpdate."""
     time = {"sec": found.time_ns // 10**9, "nsec": found.time_ns % 10**9}
     entities = []
     for row, box in enumerate(found.detections):

@@ -1,9 +1,9 @@
-"""What has been detected in a recording so far: lines that a killed run leaves and the next one goes on from.
+"""Journal of a recording's detections: lines that remain of a killed run and that the next one resumes from.
 
-The journal holds what detection gave, scan by scan and to the last bit; identities and all files that a user wants are
-made of it at the end, in one go and atomically. So they are the same whether the run was killed or not. Its first line
-says what the results depend on; a journal of anything else is begun anew. Every line has a digest
-(`base.files`): one that a kill cut in two, or that was damaged since, is dropped, and its scan done again.
+The journal holds the detections of every scan, to the last bit; track identities and all output files are made from
+it at the end, atomically. So they are the same whether the run was killed or not. Its first line says what the results
+depend on; if that differs, the journal is begun anew. Every line has a digest (`base.files`): a truncated or damaged
+one is dropped, and its scan processed again.
 """
 
 import json
@@ -24,11 +24,11 @@ from asca_pillars.detection.detections import Detections
 
 JOURNAL_FILE = "detections.partial.jsonl"
 _LONGEST_HEAD_BYTES = 1 << 24
-_KEY = "journal of asca detect"  # of the first line, whose text is the key of the others
+_KEY = "journal of asca detect"  # key of the first line, whose text is the key of the others
 
 
 class ScanResult(NamedTuple):
-    """What is known of one message: its number, time and frame, and what was found or why it was skipped."""
+    """Result of one message: its number, time and frame, and its detections or why it was skipped."""
 
     number: int
     time_ns: int
@@ -66,7 +66,7 @@ class Journal:
 
     @property
     def done(self) -> int:
-        """How many messages it holds."""
+        """Number of messages in the journal."""
         return len(self._starts)
 
     def __contains__(self, number: int) -> bool:
@@ -115,7 +115,7 @@ class Journal:
         self._end += len(content)
 
     def results(self) -> Iterator[ScanResult]:
-        """All results, in the order of the messages."""
+        """Yield all results in the order of the messages."""
         for line in self._lines([self._starts[number] for number in sorted(self._starts)]):
             text = unsealed(line, self._about)
             if text is None:
@@ -123,7 +123,7 @@ class Journal:
             yield self._result(json.loads(text))
 
     def remove(self) -> None:
-        """Done: what it was for has been written."""
+        """Delete the journal after its results have been written."""
         self.path.unlink()
 
     def _whole_lines(self) -> list[int] | None:

@@ -1,4 +1,4 @@
-"""Scans and boxes as a file that the rerun viewer opens: `rerun out.rrd`."""
+"""Scans and boxes as a file for the rerun viewer: `rerun out.rrd`."""
 
 import errno
 from pathlib import Path
@@ -11,14 +11,14 @@ from asca_deploy.recordings.results import Found
 from asca_pillars.pictures.colors import class_rgb, ground_height, height_rgb
 from asca_pillars.scans.recordings.images import CameraImage, NearestImages
 
-MAX_POINTS = 20_000  # of a scan that are shown: a whole revolution of 120,000 makes 14 MB a second
+MAX_POINTS = 20_000  # points shown of a scan: a whole revolution of 120,000 takes 14 MB a second
 TIMELINE = "time"
 MOVES_MPS = 0.5
-"""Slower tracks have no arrow."""
+"""Speed below which tracks have no arrow."""
 _BACKGROUND = (14, 18, 24)
 _CAMERA = "camera"
 APPLICATION = "asca-pillars"
-_HEAD_BYTES = 4096  # of a file, among which the application's name is
+_HEAD_BYTES = 4096  # leading bytes of a file that hold the application's name
 _FLUSH_S = 60.0
 
 
@@ -53,7 +53,7 @@ class RerunFile:
         self._ground_m: float | None = None
 
     def write(self, found: Found, points: NDArray[np.float32] | None) -> None:
-        """One scan with its boxes."""
+        """Write one scan with its boxes."""
         assert points is not None, "it shows points"
         rr, stream = self._rr, self._stream
         stream.set_time(TIMELINE, timestamp=np.datetime64(found.time_ns, "ns"))
@@ -76,7 +76,7 @@ class RerunFile:
             self._stream.disconnect()
 
     def _flush(self) -> None:
-        """After each scan: once its writer has failed, rerun says so here, and waits forever anywhere else."""
+        """Flush after each scan: once its writer has failed, rerun reports it here and blocks anywhere else."""
         try:
             self._stream.flush(timeout_sec=_FLUSH_S)
         except RuntimeError as error:
@@ -109,7 +109,7 @@ class RerunFile:
             self._stream.log(_CAMERA, self._rr.Image(image.content, color_model=image.kind))
 
     def _velocities(self, found: Found) -> Any:
-        """An arrow for each track that moves, as long as its way of one second, from the center of its roof."""
+        """Return an arrow for each moving track, as long as its way of one second, from the center of its roof."""
         assert found.tracks is not None
         moving = np.hypot(*found.tracks.velocities_mps.T) > MOVES_MPS
         boxes, velocities = found.detections.boxes[moving], found.tracks.velocities_mps[moving]

@@ -22,7 +22,7 @@ _MIRROR = FrameChange(np.diag([1.0, -1.0, 1.0]), np.zeros(3))
 
 
 class Found(NamedTuple):
-    """The boxes of one scan as they are written; `tracks` is None where nobody asked for identities."""
+    """Boxes of one scan as they are written; `tracks` is None without tracking."""
 
     number: int
     time_ns: int
@@ -33,16 +33,16 @@ class Found(NamedTuple):
 
 
 class ResultFile(Protocol):
-    """Something that results are written to, one scan after the other."""
+    """Output of results, one scan after the other."""
 
     def write(self, found: Found, points: NDArray[np.float32] | None) -> None:
-        """The next scan, and its points (N, 4) where some file of the run draws them."""
+        """Write the next scan, and its points (N, 4) where some file of the run draws them."""
 
 
 def tracked(
     journal: Journal, tracker: Tracker | None, pose_at: Callable[[int], NDArray[np.float64]] | None = None
 ) -> Iterator[Found]:
-    """The results of a journal, in its order, with identities if there is a tracker; not those that were skipped.
+    """Yield the results of a journal, in its order, with identities if there is a tracker; not those that were skipped.
 
     Args:
         journal: of all scans.
@@ -66,7 +66,7 @@ def tracked(
 
 
 def _track(tracker: Tracker, found: Found, pose: NDArray[np.float64] | None) -> Tracks:
-    """The next scan; if its frame is a mirror image, so that its pose is none of a body, its own mirror image."""
+    """Track the next scan; mirrored, if its frame is a mirror image, as its pose is then no rotation."""
     time_s = found.time_ns * 1e-9
     if pose is None or np.linalg.det(pose[:3, :3]) > 0:
         return tracker(found.detections, time_s, pose)
@@ -77,7 +77,7 @@ def _track(tracker: Tracker, found: Found, pose: NDArray[np.float64] | None) -> 
 
 
 def tracking_order(times_ns: Sequence[int]) -> list[int]:
-    """The order in which recorded scans are tracked: by time, drive by drive.
+    """Return the order in which recorded scans are tracked: by time, drive by drive.
 
     A scan that came late, or one wrong stamp, then ends no tracks but its own. Another drive begins where two scans lie
     more than MAX_SCAN_GAP_S before the two recorded before them, as when a clock was set or a drive is played again:
@@ -93,7 +93,7 @@ def tracking_order(times_ns: Sequence[int]) -> list[int]:
 
 
 def said_of_stamps(times_ns: Sequence[int]) -> str | None:
-    """A sentence if stamps of recorded scans go back, or on by more than the pause that ends tracks."""
+    """Return a sentence if stamps of recorded scans go back, or on by more than the pause that ends tracks."""
     steps = np.diff(np.array(times_ns, np.int64))
     back, ahead = int((steps < 0).sum()), int((steps > round(MAX_SCAN_GAP_S * 1e9)).sum())
     if not back and not ahead:
@@ -111,7 +111,7 @@ class JsonLines:
         self._file, self._recording, self._detector = file, recording, scope.to_json()
 
     def write(self, found: Found, points: NDArray[np.float32] | None = None) -> None:
-        """One line."""
+        """Write one line."""
         boxes = found.detections.to_dicts() if found.tracks is None else found.tracks.to_dicts()
         line = {
             "scan": f"{self._recording}/{found.number:06d}",
@@ -132,7 +132,7 @@ class KittiTracks:
         self._file, self._calibration = file, calibration
 
     def write(self, found: Found, points: NDArray[np.float32] | None = None) -> None:
-        """The lines of one scan."""
+        """Write the lines of one scan."""
         boxes = found.detections
         objects = objects_from_boxes(boxes.boxes, boxes.names, self._calibration, DEFAULT_IMAGE_SIZE_WH, boxes.scores)
         ids = [-1] * len(objects) if found.tracks is None else found.tracks.track_ids.tolist()
@@ -142,5 +142,5 @@ class KittiTracks:
 
 
 def open_text(stack: ExitStack, path: Path) -> IO[str]:
-    """A text file to write that is closed with the stack."""
+    """Open a text file for writing; it is closed with the stack."""
     return stack.enter_context(path.open("w", encoding="utf-8"))

@@ -1,4 +1,4 @@
-"""The files that are made of scans over time, of a recording or of a folder: for Foxglove, for rerun, a video."""
+"""Files of scans over time, of a recording or a folder: Foxglove, rerun, video."""
 
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
@@ -24,7 +24,7 @@ from asca_pillars.scans.recordings.images import NearestImages
 
 @dataclass(frozen=True, kw_only=True)
 class SequenceFiles:
-    """The files to write; None: not that one."""
+    """Paths of the files to write; None for those not wanted."""
 
     foxglove: Path | None = None
     rerun: Path | None = None
@@ -66,7 +66,7 @@ class SequenceFiles:
         pose_at: Callable[[int], NDArray[np.float64]] | None = None,
         images: NearestImages | None = None,
     ) -> list[ResultFile]:
-        """Open them.
+        """Open the files.
 
         Args:
             places: gives them their names when it closes without an error.

@@ -35,7 +35,7 @@ def require_video(video: Path | None, view: str, inputs: Sequence[Path | None]) 
 
 
 def recording_rate_hz(times_ns: Sequence[int]) -> float:
-    """Scans per second of a recording or folder, by the usual pause between two of them; 10 where that says nothing."""
+    """Return the scans per second of a recording or folder, by the usual pause between two; 10 if unknown."""
     steps = np.diff(np.sort(np.array(times_ns, np.int64)))
     steps = steps[steps > 0]
     return float(np.clip(1e9 / float(np.median(steps)), *_RATES_HZ)) if len(steps) else _USUAL_RATE_HZ
@@ -67,7 +67,7 @@ class RecordingVideo:
         self._video = BoxVideo(self._file, view, ranges, level)
 
     def write(self, found: Found, points: NDArray[np.float32] | None) -> None:
-        """One picture."""
+        """Write one picture."""
         assert points is not None, "it shows points"
         ids = None if found.tracks is None else found.tracks.track_ids
         pose = None if self._pose_at is None else self._pose_at(found.time_ns)

@@ -1,1 +1,1 @@
-"""`asca ros2`: a node that answers a topic of point clouds with boxes."""
+"""ROS 2 node of `asca ros2`: publishes boxes for a topic of point clouds."""

@@ -11,51 +11,51 @@ import numpy as np
 from asca_deploy.ros2.messages import ERROR, OK, WARN
 
 _QUIET_S = 2.0
-"""A sensor that sends nothing for so long is worth a warning."""
+"""Seconds without a message after which diagnostics warn."""
 _MOST_LATENCIES = 10_000
 
 
 @dataclass
 class Health:
-    """Counters since the start; several threads count."""
+    """Counters since the start; thread-safe."""
 
     received: int = 0
     """Messages of the topic."""
     answered: int = 0
     dropped: int = 0
-    """Scans that gave way to a later one before the detector had time for them."""
+    """Scans dropped in favor of later ones before the detector was free."""
     lost: int = 0
-    """Messages that the middleware says it lost."""
+    """Messages reported lost by the middleware."""
     unreadable: int = 0
     trouble: str | None = None
-    """Why the last unreadable one was that."""
+    """Reason why the last unreadable one could not be read."""
     warnings: tuple[str, ...] = ()
     """Warnings of the last answered scan."""
     failure: str | None = None
-    """Why the detector ended."""
+    """Reason why the detector ended."""
     latencies_ms: deque[float] = field(default_factory=lambda: deque(maxlen=_MOST_LATENCIES))
-    """From a message's arrival to its answer, of the scans since the last `summary`."""
+    """Times from a message's arrival to its answer, of the scans since the last `summary`."""
     boxes: Counter[str] = field(default_factory=Counter)
-    """By class, likewise."""
+    """Boxes by class, of the same scans."""
     _last_message_s: float = field(default_factory=monotonic)
     _since: tuple[float, int] = field(default_factory=lambda: (monotonic(), 0))
     _told: tuple[int, int, int] = (0, 0, 0)
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
     def take(self) -> None:
-        """A message came."""
+        """Count a received message."""
         with self._lock:
             self.received += 1
             self._last_message_s = monotonic()
 
     def refuse(self, why: str) -> None:
-        """The message could not be read."""
+        """Count a message that could not be read."""
         with self._lock:
             self.unreadable += 1
             self.trouble = why
 
     def answer(self, latency_ms: float, names: list[str], warnings: tuple[str, ...]) -> None:
-        """A scan was answered with boxes of these classes."""
+        """Count a scan answered with boxes of these classes."""
         with self._lock:
             self.answered += 1
             self.latencies_ms.append(latency_ms)
@@ -85,7 +85,7 @@ class Health:
             return figures
 
     def status(self, topic: str, publishers: int) -> tuple[int, str]:
-        """A level of diagnostics and a sentence about the time since the last call."""
+        """Return a level of diagnostics and a sentence about the time since the last call."""
         with self._lock:
             before, self._told = self._told, (self.dropped, self.lost, self.unreadable)
             dropped, lost, unreadable = (now - then for now, then in zip(self._told, before, strict=True))

@@ -1,4 +1,4 @@
-"""Point clouds that come when they like, answered with boxes: all of the node that needs no ROS."""
+"""Live detection in point clouds that arrive at any time; the part of the node without ROS."""
 
 import threading
 from collections.abc import Callable, Iterator
@@ -32,19 +32,19 @@ _REMIND_S = 5.0
 
 Answer = Callable[[Stamp, ScanDetections | Tracks], None]
 Log = Callable[..., None]
-"""Of an event by its name, and what is to be known of it by names."""
+"""Function that logs an event: its name, and its values by keyword."""
 
 
 @dataclass(frozen=True)
 class _Taken:
-    """A scan while it waits."""
+    """A waiting scan."""
 
     stamp: Stamp
     at_s: float
 
 
 class Live:
-    """A queue that takes clouds in one thread and a detector that answers them in another (`run`).
+    """Live detection: a queue that one thread fills with clouds, and a detector that another runs (`run`).
 
     Args:
         open_detector: a detector for a mounting; called once, or twice where scans decide the mounting.
@@ -77,7 +77,7 @@ class Live:
         self._tracker, self._pose_of = tracker, pose_of
         self._queue = ScanQueue("drop")
         self._ended = threading.Event()
-        self._frame_id: str | None = None  # of the scans whose transform was taken
+        self._frame_id: str | None = None  # frame of the scans whose transform is used
         self._scale: float | None = None
         self._scale_scans = 0
         self._is_answering = False
@@ -91,11 +91,11 @@ class Live:
 
     @property
     def model(self) -> str:
-        """The name of the model."""
+        """Name of the model."""
         return self._detector.bundle.name
 
     def take(self, cloud: Any) -> None:
-        """Hand in a `sensor_msgs/PointCloud2`, or an object like it; the oldest scan that waits gives way to it."""
+        """Enqueue a `sensor_msgs/PointCloud2`, or an object like it; a full queue drops its oldest scan."""
         at_s = monotonic()
         self.health.take()
         stamp = stamp_of(cloud.header)
@@ -114,7 +114,7 @@ class Live:
             self._working_since = at_s
 
     def run(self) -> None:
-        """Answer scans until `close`; what ends it early is raised, and in `health.failure`."""
+        """Answer scans until `close`; errors are raised, and recorded in `health.failure`."""
         try:
             if not self._is_stated and not self._find_mounting():
                 return
@@ -134,18 +134,18 @@ class Live:
             raise
 
     def close(self) -> None:
-        """No scan is answered any more but the one that the detector has."""
+        """Stop answering scans, except the one in the detector."""
         self._ended.set()
         self._queue.close()
         self._queue.interrupt()
 
     def busy_s(self) -> float:
-        """For how long the detector has been at a scan without an answer; 0 while it waits for one."""
+        """Return the seconds that the detector has spent on a scan without an answer; 0 while it waits for one."""
         since = self._working_since
         return 0.0 if since is None else monotonic() - since
 
     def _points(self, cloud: Any) -> NDArray[np.float32]:
-        """The finite points of a cloud, their reflectances in 0..1 by the scale that the first scans have."""
+        """Return the finite points of a cloud, their reflectances in 0..1 by the scale that the first scans have."""
         stored = point_cloud_points(cloud, "the scan")
         scale = self._reading.reflectance_scale
         if scale == "auto" and stored.reflectance is not None:
@@ -203,7 +203,7 @@ class Live:
             yield NamedPoints(f"scan {number}", points)
 
     def _warmed_up(self) -> Detector:
-        """A detector whose first scan takes no longer than those after it."""
+        """Return a detector that is warmed up."""
         detector = self._open(self._mounting)
         points = read_scan(sample_scan_path()).points
         for _ in range(_WARM_UP_SCANS):

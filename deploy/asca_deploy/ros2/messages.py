@@ -1,4 +1,4 @@
-"""Messages of the node, as dicts with the fields of ROS' messages; nothing here needs ROS.
+"""Messages of the node, as dicts with the fields of ROS messages; independent of ROS.
 
 `filled` makes messages of them. Every box keeps the stamp and the frame of its scan. A field that a dict leaves out has
 the message's own default.
@@ -25,7 +25,7 @@ _NESTED = re.compile(r"(?:sequence<)?(?P<package>\w+)/(?P<name>\w+)(?:, \d+)?>?"
 
 
 class Stamp(NamedTuple):
-    """The header of a scan, which all that is published of it has, too."""
+    """Header of a scan and of all messages published for it."""
 
     sec: int
     nanosec: int
@@ -33,21 +33,21 @@ class Stamp(NamedTuple):
 
     @property
     def seconds(self) -> float:
-        """As one number."""
+        """The time stamp in seconds."""
         return self.sec + self.nanosec * 1e-9
 
     def header(self) -> Fields:
-        """`std_msgs/Header`."""
+        """Return a `std_msgs/Header`."""
         return {"stamp": {"sec": self.sec, "nanosec": self.nanosec}, "frame_id": self.frame_id}
 
 
 def stamp_of(header: Any) -> Stamp:
-    """Stamp and frame of a `std_msgs/Header`."""
+    """Return the stamp and frame of a `std_msgs/Header`."""
     return Stamp(int(header.stamp.sec), int(header.stamp.nanosec), str(header.frame_id))
 
 
 def marker_array(stamp: Stamp, found: Detections | Tracks, *, lifetime_s: float = 0.5) -> Fields:
-    """`visualization_msgs/MarkerArray`: what deletes the boxes of the scan before, then this scan's.
+    """Return a `visualization_msgs/MarkerArray`: deletion of the earlier boxes, then this scan's.
 
     A box is a cube and a text with class and score; of a track the text has the identity, and an arrow says where it
     will be in a second.
@@ -83,7 +83,7 @@ def marker_array(stamp: Stamp, found: Detections | Tracks, *, lifetime_s: float 
 
 
 def detection_array(stamp: Stamp, found: Detections | Tracks) -> Fields:
-    """`vision_msgs/Detection3DArray`: a detection for each box, with its class and score; of a track its identity.
+    """Return a `vision_msgs/Detection3DArray`: a detection with class and score for each box, identities of tracks.
 
     Args:
         stamp: of the scan.
@@ -110,7 +110,7 @@ def detection_array(stamp: Stamp, found: Detections | Tracks) -> Fields:
 def diagnostic_array(
     sec: int, nanosec: int, *, level: int, message: str, hardware_id: str, values: Mapping[str, object]
 ) -> Fields:
-    """`diagnostic_msgs/DiagnosticArray` of one status.
+    """Return a `diagnostic_msgs/DiagnosticArray` of one status.
 
     Args:
         sec: when, seconds.
@@ -126,7 +126,7 @@ def diagnostic_array(
 
 
 def filled(message: Any, fields: Mapping[str, Any]) -> Any:
-    """A message of ROS 2's Python, with these fields set; the others keep their values."""
+    """Return a message of ROS 2's Python, with these fields set; the others keep their values."""
     kinds = message.get_fields_and_field_types()
     for name, value in fields.items():
         if isinstance(value, Mapping):
@@ -140,7 +140,7 @@ def filled(message: Any, fields: Mapping[str, Any]) -> Any:
 
 
 def message_type(kind: str) -> Any:
-    """The class of a type as ROS 2 writes it: `visualization_msgs/Marker`, or a sequence of these."""
+    """Return the class of a type as ROS 2 writes it: `visualization_msgs/Marker`, or a sequence of these."""
     match = _NESTED.fullmatch(kind)
     if match is None:
         raise ValueError(f"{kind}: no type of messages")
@@ -154,7 +154,7 @@ def _with_tracks(found: Detections | Tracks) -> list[tuple[Detection, tuple[int,
 
 
 def _pose(box: Detection, *, lift_m: float = 0.0, yaw_rad: float | None = None) -> Fields:
-    """`geometry_msgs/Pose` of a box's center, or above it; turned about z."""
+    """Return a `geometry_msgs/Pose` of a box's center, or above it; turned about z."""
     half = (box.yaw_rad if yaw_rad is None else yaw_rad) / 2
     return {
         "position": {"x": box.x_m, "y": box.y_m, "z": box.z_m + lift_m},

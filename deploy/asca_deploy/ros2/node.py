@@ -1,4 +1,4 @@
-"""The node: the only module that imports ROS 2, whose `rclpy` comes with ROS or with the extra `ros2`."""
+"""ROS 2 node; the only module that imports `rclpy`, which comes with ROS or with the extra `ros2`."""
 
 import json
 import os
@@ -74,7 +74,7 @@ class NodeSettings:
 
 
 def reliability(offered: Sequence[str], qos: Qos) -> Literal["best_effort", "reliable"] | None:
-    """The reliability to subscribe with; None where that depends on publishers and there are none yet.
+    """Return the reliability to subscribe with; None if it depends on publishers and there are none yet.
 
     A reliable subscription gets nothing of a best-effort publisher. A best-effort subscription gets messages of both,
     but loses each one that lacks a fragment, as clouds larger than the middleware's buffers do.
@@ -82,7 +82,7 @@ def reliability(offered: Sequence[str], qos: Qos) -> Literal["best_effort", "rel
 
     Args:
         offered: by each publisher, "reliable" or "best_effort".
-        qos: what was asked for.
+        qos: the setting.
     """
     if qos != "auto":
         return qos
@@ -92,7 +92,7 @@ def reliability(offered: Sequence[str], qos: Qos) -> Literal["best_effort", "rel
 
 
 def log(event: str, **facts: Any) -> None:
-    """A line of JSON on standard output, with the time."""
+    """Print a line of JSON with the time on standard output."""
     print(json.dumps({"time_s": round(time.time(), 3), "event": event} | facts), flush=True)
 
 
@@ -197,12 +197,12 @@ class _Node:
         self.node.create_timer(_STATUS_S, self._tell)
 
     def publishers(self) -> list[Callable[[Stamp, ScanDetections | Tracks], None]]:
-        """Publisher of the boxes of a scan."""
+        """Return the publishers of the boxes of a scan."""
         both = [self._publish(self._markers, marker_array), self._publish(self._detections, detection_array)]
         return [one for one in both if one is not None]
 
     def close(self) -> None:
-        """Take everything back that ROS sees."""
+        """Destroy the ROS node."""
         self.node.destroy_node()
 
     def _publish(
@@ -229,7 +229,7 @@ class _Node:
             return None
 
     def _follow(self) -> None:
-        """Subscribe as the publishers offer."""
+        """Subscribe with the publishers' reliability."""
         qos = self._rclpy.qos
         offered = [
             "reliable" if one.qos_profile.reliability == qos.ReliabilityPolicy.RELIABLE else "best_effort"
@@ -252,7 +252,7 @@ class _Node:
         log("subscribed", topic=self.topic, reliability=wanted, publishers=len(offered))
 
     def _events(self) -> Any:
-        """Callbacks of the middleware, as far as this one has them."""
+        """Return the callbacks for events of the middleware."""
         from rclpy.event_handler import SubscriptionEventCallbacks
 
         def lost(event: Any) -> None:
@@ -282,7 +282,7 @@ class _Node:
 
 @contextmanager
 def _stop_signals() -> Iterator[threading.Event]:
-    """An event that SIGINT and SIGTERM set; a second signal ends the process as it would without."""
+    """Yield an event that SIGINT and SIGTERM set; a second signal ends the process as usual."""
     stop = threading.Event()
     kinds = signal.SIGINT, signal.SIGTERM
     before = {kind: signal.getsignal(kind) for kind in kinds}

@@ -21,15 +21,15 @@ class Systemd:
         self.watchdog_s = int(microseconds) / 1e6 if is_watched and int(microseconds) else None
 
     def ready(self, status: str) -> None:
-        """The service does its work from here on; `status` is what `systemctl status` shows."""
+        """Notify that the service is ready; `status` is what `systemctl status` shows."""
         self._send("READY=1", f"STATUS={status}")
 
     def alive(self, status: str) -> None:
-        """The service still works."""
+        """Notify that the service is alive."""
         self._send("WATCHDOG=1", f"STATUS={status}")
 
     def stopping(self) -> None:
-        """The service ends."""
+        """Notify that the service is stopping."""
         self._send("STOPPING=1")
 
     def _send(self, *lines: str) -> None:

@@ -1,4 +1,4 @@
-"""The pipeline of kind pillar_refine: a pillar detector proposes, a second graph refines (PV-RCNN, section 3)."""
+"""Pipeline of kind pillar_refine: proposals of a pillar detector, refined by a second graph (PV-RCNN, section 3)."""
 
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -33,16 +33,16 @@ class PreparedScan(NamedTuple):
 
     pillars: PreparedPillars
     points: NDArray[np.float32]
-    """(N, 4), which the second stage looks at again."""
+    """(N, 4), which the second stage reads too."""
 
     @property
     def counts(self) -> PillarCounts:
-        """What became of its points in the first stage."""
+        """Counts of the scan's points in the first stage."""
         return self.pillars.counts
 
 
 class FirstAnswer(NamedTuple):
-    """What the first stage says of a scan."""
+    """Outputs of the first stage for one scan."""
 
     found: FirstPass
     points: NDArray[np.float32]
@@ -60,7 +60,7 @@ class RefinePipeline:
         provider, precision, threads: of the backbone; the second stage has as many threads.
 
     Raises:
-        BundleError: a graph cannot be run or is not what the manifest says.
+        BundleError: a graph cannot be run or does not match the manifest.
         ProviderError: the provider does not start.
     """
 
@@ -89,17 +89,17 @@ class RefinePipeline:
         self._executor = ThreadPoolExecutor(1) if threads > 1 else None
 
     def prepare(self, points: NDArray[np.float32], laps: Laps) -> PreparedScan:
-        """Points (N, 4) -> the input of the first stage's backbone."""
+        """Prepare the input of the first stage's backbone from points (N, 4)."""
         return PreparedScan(self.first.prepare(points, laps), points)
 
     def infer(self, prepared: PreparedScan, laps: Laps) -> FirstAnswer:
-        """The placed pillars -> the first stage's head maps and its neck's map, or rows of both."""
+        """Run the first stage's backbone: head maps and the neck's map, or rows of both."""
         found = self.first.backbone.infer_with_neck(prepared.pillars.placed)
         laps.append(("neck+head", perf_counter()))
         return FirstAnswer(found, prepared.points)
 
     def finish(self, raw: FirstAnswer, laps: Laps) -> Detections:
-        """Head maps -> proposals -> refined boxes above the score threshold that survive the rotated NMS."""
+        """Decode proposals, refine them, and return the boxes that thresholds and rotated NMS keep."""
         proposed = proposed_from(raw.found, raw.points, self.spec, self.section.seen)
         laps.append(("propose", perf_counter()))
         scan = refine_scan(raw.points, proposed, proposed.proposals, self.section.neighbors, self._executor)
@@ -112,7 +112,7 @@ class RefinePipeline:
         return detections
 
     def refine(self, inputs: Mapping[str, NDArray[Any]]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Confidence logits (R,) and residuals (R, 7) of the proposals of a scan, from its `refine_inputs`."""
+        """Return confidence logits (R,) and residuals (R, 7) of the proposals of a scan, from its `refine_inputs`."""
         if not len(inputs["roi_features"]):
             return np.empty(0, np.float32), np.empty((0, 7), np.float32)
         confidence, residuals = run_graph(self._second, OUTPUTS, inputs)
@@ -120,7 +120,7 @@ class RefinePipeline:
 
 
 def refine_inputs(scan: RefineScan) -> dict[str, NDArray[Any]]:
-    """What refine.onnx takes, by name, see `refine_interface`."""
+    """Return the inputs of refine.onnx by name, see `refine_interface`."""
     inputs: dict[str, NDArray[Any]] = {"keypoints": scan.keypoints, "bev": scan.bev}
     for number, indices in enumerate(scan.ball_indices):
         inputs[f"ball_{number}"] = gather_balls(scan.points, scan.keypoints, indices)
@@ -134,13 +134,13 @@ def refine_inputs(scan: RefineScan) -> dict[str, NDArray[Any]]:
 
 
 def grid_names(number: int, samples: int) -> GroupedBalls[str]:
-    """Names of the inputs for the balls around grid points, of one radius."""
+    """Return the names of the inputs for the balls around grid points, of one radius."""
     groups = [(f"grid_{number}_queries_{width}", f"grid_{number}_members_{width}") for width in group_widths(samples)]
     return GroupedBalls(tuple(BallGroup(*group) for group in groups), f"grid_{number}_rows")
 
 
 def refine_interface(section: RefineSection, classes: int) -> Interface:
-    """Inputs and outputs of refine.onnx."""
+    """Return inputs and outputs of refine.onnx."""
     neighbors = section.neighbors
     inputs = {"keypoints": Tensor("float32", (None, 3)), "bev": Tensor("float32", (None, section.bev_channels))}
     for number in range(len(neighbors.ball_radii_m)):

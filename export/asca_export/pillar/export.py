@@ -1,4 +1,4 @@
-"""A checkpoint of a pillar detector becomes a bundle."""
+"""Export of a pillar detector's checkpoint to a bundle."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -30,7 +30,7 @@ def export_pillar_bundle(
     scans: Sequence[NDArray[np.float32]],
     options: ExportOptions = DEFAULTS,
 ) -> PillarBundle:
-    """`asca_export.export.export_bundle` of kind pillar: encoder.onnx and backbone.onnx."""
+    """Export kind pillar, see `asca_export.export.export_bundle`: encoder.onnx and backbone.onnx."""
     model, detector, calibration = checkpoint.config.model, checkpoint.detector, options.calibration
     assert isinstance(model, PillarModel) and isinstance(detector, PillarDetector), "it is of kind pillar"
     require_parity_scans(scans)
@@ -72,7 +72,7 @@ def require_maskable(model: ModelConfig, *, int8: bool) -> None:
 def _export_graphs(
     detector: PillarDetector, folder: Path, scans: Sequence[NDArray[np.float32]], *, dense_neck: bool
 ) -> float:
-    """Write both graphs; the backbone's multiply-accumulates, 10^9, of a sparse neck in the mean over the scans."""
+    """Write both graphs; return the backbone's multiply-accumulates, 10^9, of a sparse neck the mean over scans."""
     preparation = detector.preparation
     encode = fast_encoder(detector.encode)
     graphs.export_encoder(MarkedEncoder(encode) if dense_neck else encode, graphs.graph_path(folder, ENCODER))

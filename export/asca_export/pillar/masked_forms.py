@@ -21,7 +21,7 @@ _LEAST = 2.0**-24
 
 
 class MarkedEncoder(nn.Module):
-    """An encoder of whose features none is exactly zero, so that a cell of zeros is one without a pillar."""
+    """Encoder whose features are never exactly zero, so that a cell of zeros is one without a pillar."""
 
     def __init__(self, encode: nn.Module) -> None:
         super().__init__()
@@ -37,7 +37,7 @@ class MaskedBackbone(nn.Module):
     """Neck and head of a detector with a sparse neck on a pseudo-image of features that `MarkedEncoder` gives.
 
     Args:
-        detector: in evaluation mode; it stays as it is.
+        detector: in evaluation mode; not modified.
     """
 
     def __init__(self, detector: PillarDetector) -> None:
@@ -48,7 +48,7 @@ class MaskedBackbone(nn.Module):
         self.border = self.dense.border
 
     def stages(self) -> list[Stage]:
-        """As of `FastBackbone`."""
+        """Return the stages of `FastBackbone`."""
         return self.dense.stages()
 
     def forward(self, canvas: Tensor) -> tuple[Tensor, ...]:
@@ -70,7 +70,7 @@ class MaskedBackbone(nn.Module):
 
 
 def _repeated(cells: Tensor, stride: int) -> Tensor:
-    """Each cell of a mask for the head cells below it: (1, 1, H, W) -> (1, stride * H, stride * W, 1)."""
+    """Repeat each cell of a mask for the head cells below it: (1, 1, H, W) -> (1, stride * H, stride * W, 1)."""
     _, _, height, width = cells.shape
     wide = cells[0, 0, :, None, :, None].expand(height, stride, width, stride)
     return wide.reshape(1, height * stride, width * stride, 1)

@@ -1,4 +1,4 @@
-"""A checkpoint of PV-RCNN becomes a bundle."""
+"""Export of a PV-RCNN checkpoint to a bundle."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -28,7 +28,7 @@ def export_pv_rcnn_bundle(
     scans: Sequence[NDArray[np.float32]],
     options: ExportOptions = DEFAULTS,
 ) -> PvRcnnBundle:
-    """`asca_export.export.export_bundle` of kind pv_rcnn: four graphs.
+    """Export kind pv_rcnn, see `asca_export.export.export_bundle`: four graphs.
 
     With `options.calibration` the first stage is put in 8 bits; what follows the proposals stays in float32.
     """

@@ -48,19 +48,19 @@ def export_refine_head(network: PvRcnn, bundle: PvRcnnBundle, path: Path) -> Non
 
 
 def export_deform(network: PvRcnn, bundle: PvRcnnBundle, path: Path) -> None:
-    """Write deform.onnx alone: the places that keypoints of a deformed source look around."""
+    """Write deform.onnx alone: the shifted positions of keypoints for each deformed source."""
     inputs, outputs = interfaces.deform_interface(bundle)
     export_row_graph(_Deform(network), path, inputs, _source_rows(inputs, bundle.pv_rcnn.settings.sources), outputs)
 
 
 def _source_rows(inputs: Mapping[str, Declared], sources: Sequence[SourceBalls]) -> dict[str, str]:
-    """What each input has a row of: a voxel of its source, or a keypoint."""
+    """Return by input what its rows are: voxels of a source, positions of a scale, or keypoints."""
     of_source = {f"{each.source}{suffix}": each.source for each in sources for suffix in ("", "_positions")}
     return {name: of_source.get(name) or _scale_row(name) or "keypoints" for name in inputs}
 
 
 def _scale_row(name: str) -> str:
-    """Of scale_1_groups scale_1; of scale_1_nearest, which has a row of each position of the scale before, scale_0."""
+    """Return the scale of an input's rows: scale_1 for scale_1_groups and scale_2_nearest, "" for keypoints."""
     if not (found := re.fullmatch(r"scale_(\d+)_(groups|positions|nearest|nearest_weights)", name)):
         return ""
     scale = int(found[1]) - found[2].startswith("nearest")
@@ -101,7 +101,7 @@ class _Keypoints(nn.Module):
 
 
 class _Deform(nn.Module):
-    """The shifts of all deformed sources, likewise."""
+    """The shifts of all deformed sources, with one argument for each input of the graph."""
 
     def __init__(self, network: PvRcnn) -> None:
         super().__init__()
@@ -119,7 +119,7 @@ class _Deform(nn.Module):
 
 
 class _Refine(nn.Module):
-    """The second stage's head, likewise."""
+    """The second stage's head, with one argument for each input of the graph."""
 
     def __init__(self, head: RoiHead) -> None:
         super().__init__()

@@ -1,4 +1,4 @@
-"""A proven float bundle of PV-RCNN becomes one whose first stage is in 8 bits.
+"""Quantization of a proven float bundle of PV-RCNN: the first stage in 8 bits.
 
 The sparse backbone and the backbone on the map take most of the time and gain the most. Keypoints and proposals are
 refined in float32: their graphs take positions in metres. They read the levels' real values and the map in steps.
@@ -91,7 +91,7 @@ def quantize_pv_rcnn_bundle(
 def _round(
     network: PvRcnn, bundle: PvRcnnBundle, pipeline: PvRcnnPipeline, calibration: Sequence[Points], work: Path
 ) -> tuple[RoundedVoxels, RoundedMaps, CanvasSteps]:
-    """Both backbones with rounded weights, and the steps of the map between them."""
+    """Return both backbones with rounded weights, and the steps of the map between them."""
     voxelized = [pipeline.voxelize(points) for points in calibration]
     samples = [
         VoxelSample(

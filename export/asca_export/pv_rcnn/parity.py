@@ -1,4 +1,4 @@
-"""The proof that a pv_rcnn bundle is the trained model: graph by graph on the same inputs, then the boxes."""
+"""Parity of a pv_rcnn bundle and the trained model: graph by graph on the same inputs, then the boxes."""
 
 from collections.abc import Sequence
 
@@ -19,7 +19,7 @@ from asca_pillars.ops.points.sampling import read_map
 from asca_pillars.ops.pv_rcnn.prepare import LEVEL_SOURCES, voxel_scan
 from asca_pillars.ops.two_stage.prepare import grid_neighbors
 
-RELATIVE_TOLERANCE = 1e-4  # of what a graph gives, to its largest value where that is above 1
+RELATIVE_TOLERANCE = 1e-4  # of a graph's outputs, relative to their largest value where that is above 1
 
 Array = NDArray[np.float32]
 
@@ -80,13 +80,13 @@ def prove_pv_rcnn_parity(network: PvRcnn, runtime: PvRcnnPipeline, scans: Sequen
 
 
 def _places(network: PvRcnn, batch: VoxelBatch[torch.Tensor], levels: Sequence[torch.Tensor]) -> dict[str, Array]:
-    """What PyTorch says of the shifted keypoints, by the names of the graph's outputs."""
+    """Return PyTorch's shifted keypoints by the names of the graph's outputs."""
     with torch.inference_mode():
         places = network.deformed_places(batch, levels)
     return {f"{name}_place_{number}": each.numpy() for name, own in places.items() for number, each in enumerate(own)}
 
 
 def _require(stage: str, expected: Array, found: Array, scan: int) -> float:
-    """The largest difference, relative to the largest value where that is above 1."""
+    """Return the largest difference, relative to the largest value where that is above 1."""
     scale = max(1.0, float(np.abs(expected).max(initial=0.0)))
     return require_close(stage, expected, found, RELATIVE_TOLERANCE * scale, scan) / scale

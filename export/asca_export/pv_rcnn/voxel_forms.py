@@ -22,16 +22,16 @@ from asca_export.sparse_quantize import count_steps, highest_outputs, mixed_prod
 from asca_pillars.models.pv_rcnn.layers import SparseConvBlock, VoxelBackbone
 from asca_pillars.ops.pv_rcnn.prepare import LEVEL_SOURCES
 
-_PLACES = 1000  # of each scan and layer, whose inputs weights are rounded for; 27 taps make a product of them dear
+_PLACES = 1000  # samples of each scan and layer for rounding weights; with 27 taps their product is expensive
 
 
 class VoxelSample(NamedTuple):
-    """What the backbone reads of one scan."""
+    """Inputs of the backbone for one scan."""
 
     features: Tensor
     """(N, 4) of the voxels, metres and reflectance."""
     tables: Mapping[str, Tensor]
-    """By the names of the graph's inputs."""
+    """Rulebooks by the names of the graph's inputs."""
 
 
 class VoxelProduct(NamedTuple):
@@ -41,14 +41,14 @@ class VoxelProduct(NamedTuple):
     table: str
     """The input of the graph that it gathers by."""
     level: str
-    """Of its outputs: conv1 to conv4, or OUT."""
+    """Level of its outputs: conv1 to conv4, or OUT."""
 
 
 class VoxelProducts(nn.Module):
     """A trained `VoxelBackbone` as matrix products by name, normalization in their weights.
 
     Args:
-        backbone: it stays as it is.
+        backbone: not modified.
     """
 
     def __init__(self, backbone: VoxelBackbone) -> None:
@@ -64,17 +64,17 @@ class VoxelProducts(nn.Module):
                 self.products[self.layers[-1].name] = _folded(layer)
 
     def product(self, name: str) -> nn.Linear:
-        """The product of this name: weight (outputs, taps * C) with the channels of a tap side by side."""
+        """Return the product of this name: weight (outputs, taps * C) with the channels of a tap side by side."""
         product = self.products[name]
         assert isinstance(product, nn.Linear)
         return product
 
     def last_of(self, level: str) -> str:
-        """Whose outputs are those of this level."""
+        """Return the name of the last layer of this level."""
         return [layer.name for layer in self.layers if layer.level == level][-1]
 
     def passes(self, features: Tensor, tables: Mapping[str, Tensor]) -> Iterator[tuple[str, Tensor, Tensor]]:
-        """Name, what it reads (M, taps * C) and what it gives (M, outputs) of each product in turn, mostly unitless."""
+        """Yield name, input (M, taps * C) and output (M, outputs) of each product in turn, mostly unitless."""
         for layer in self.layers:
             padded = torch.cat([features, features.new_zeros(1, features.shape[1])])
             read = padded[tables[layer.table].long()].flatten(1)
@@ -86,7 +86,7 @@ class RoundedVoxels:
     """The backbone before and after its weights are rounded, see `rounded_backbones.RoundedBackbone`.
 
     Args:
-        backbone: in evaluation mode; it stays as it is.
+        backbone: in evaluation mode; not modified.
         samples: of the calibration scans, none of them empty.
         levels: what the graph returns.
     """
@@ -94,14 +94,14 @@ class RoundedVoxels:
     def __init__(self, backbone: VoxelBackbone, samples: Sequence[VoxelSample], levels: Sequence[str]) -> None:
         self._exact, self._levels = VoxelProducts(backbone), levels
         self.steps = scale_voxels_to_steps(self._exact, samples)
-        """(C,) what a step of each product's output is worth."""
+        """(C,) value of a step of each product's output."""
         self._rounded = copy.deepcopy(self._exact)
         self.layers = [layer.name for layer in self._exact.layers[1:]]
         round_products(self._rounded, self.layers, read_moments(self._exact, samples, _PLACES))
 
     @property
     def out_steps(self) -> Tensor:
-        """(C,) unitless, what a step of the last level is worth."""
+        """(C,) unitless, value of a step of the last level."""
         return self.steps[self._exact.last_of(OUT)]
 
     def write(self, path: Path, eight_bit: Sequence[str]) -> None:
@@ -112,7 +112,7 @@ class RoundedVoxels:
 
 @torch.no_grad()
 def scale_voxels_to_steps(backbone: VoxelProducts, samples: Sequence[VoxelSample]) -> dict[str, Tensor]:
-    """Change the weights so that rows count steps, 0 to 255 times STEP_VALUE, and give what a step is worth.
+    """Change the weights so that rows count steps, 0 to 255 times STEP_VALUE; return the value of a step.
 
     Args:
         backbone: changed in place.

@@ -1,4 +1,4 @@
-"""A checkpoint of the second stage becomes a bundle with both stages."""
+"""Export of the second stage's checkpoint to a bundle with both stages."""
 
 import dataclasses
 import shutil
@@ -45,7 +45,7 @@ def export_refine_bundle(
     scans: Sequence[NDArray[np.float32]],
     options: ExportOptions = DEFAULTS,
 ) -> PillarBundle:
-    """`asca_export.export.export_bundle` of kind pillar_refine: the first stage's graphs and refine.onnx.
+    """Export kind pillar_refine, see `asca_export.export.export_bundle`: the first stage's graphs and refine.onnx.
 
     The first stage is the one that the checkpoint was trained on. With `options.calibration` it then gives way to its
     8-bit form: of a bundle the one named like it with `_int8`, of a checkpoint one made on those scans. The second
@@ -136,7 +136,7 @@ def _in_eight_bits(
 def _neck_gains(
     floating: FirstStage, eight_bit: FirstStage, calibration: Sequence[NDArray[np.float32]]
 ) -> NDArray[np.float32]:
-    """(C,) factors by which the 8-bit neck's channels come nearest to the float one's, by least squares."""
+    """Return (C,) factors by which the 8-bit neck's channels come nearest to the float one's, by least squares."""
     products = squares = np.float64(0)
     for scan in calibration:
         wanted, found = (stage(scan).neck.astype(np.float64) for stage in (floating, eight_bit))
@@ -147,7 +147,7 @@ def _neck_gains(
 
 
 def _first_bundle(source: str, temporary: Path, scans: Sequence[NDArray[np.float32]], options: ExportOptions) -> Path:
-    """Folder of the first stage, with `options.calibration` in 8 bits; a checkpoint is exported to `temporary`."""
+    """Return the first stage's folder, with `options.calibration` in 8 bits; `temporary` is for exports."""
     if not is_checkpoint(source):
         return find_bundle(source if options.calibration is None else f"{source.rstrip('/')}_int8")
     export_pillar_bundle(load_checkpoint(source), temporary, scans, options)

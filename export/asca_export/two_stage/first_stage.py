@@ -1,4 +1,4 @@
-"""The first stage of two: a backbone's graph that hands out its neck's map, and the stage as an export copies it."""
+"""First stage for the export of two stages: its backbone graph with the neck as an output, and the stage itself."""
 
 import tempfile
 from functools import partial
@@ -23,7 +23,7 @@ from asca_pillars.ops.two_stage.first_stage import FirstPass, FirstStage, requir
 
 
 def add_neck_output(backbone: onnx.ModelProto) -> onnx.ModelProto:
-    """A copy of a backbone that also returns its head's input in float32, named NECK; the rest stays as it is.
+    """Return a copy of a backbone that also returns its head's input in float32, named NECK; the rest is unchanged.
 
     It is (1, H, W, C) of a dense neck, (M, C) at the active head cells of a sparse one. Channels of an 8-bit backbone
     are scaled so that all have steps of one size.
@@ -41,7 +41,7 @@ def add_neck_output(backbone: onnx.ModelProto) -> onnx.ModelProto:
 
 
 def add_neck_steps(backbone: onnx.ModelProto) -> tuple[onnx.ModelProto, float]:
-    """As `add_neck_output` of an 8-bit backbone, but in uint8 steps, with the size of a step.
+    """Add the neck's output as `add_neck_output` does, but in uint8 steps; return the size of a step too.
 
     That is a quarter of the memory, and nothing is computed for cells that no keypoint lies on. Where the head's input
     is in floating point, or step 0 is not zero, it is `add_neck_output`, of which a step is 1.
@@ -62,7 +62,7 @@ def add_neck_steps(backbone: onnx.ModelProto) -> tuple[onnx.ModelProto, float]:
 
 
 def scale_bev(refine: onnx.ModelProto, factors: NDArray[np.float32]) -> onnx.ModelProto:
-    """A copy of the second stage's graph whose input `bev` is multiplied by `factors` (C,) first."""
+    """Return a copy of the second stage's graph whose input `bev` is multiplied by `factors` (C,) first."""
     model = onnx.ModelProto()
     model.CopyFrom(refine)
     for node in model.graph.node:
@@ -74,7 +74,7 @@ def scale_bev(refine: onnx.ModelProto, factors: NDArray[np.float32]) -> onnx.Mod
 
 
 def _with_output(backbone: onnx.ModelProto, elem_type: int) -> tuple[onnx.ModelProto, str, bool]:
-    """A copy with a declared output NECK, the name of the head's input, and whether that is in floating point."""
+    """Return a copy with a declared output NECK, the name of the head's input, and whether it is in floating point."""
     model = onnx.ModelProto()
     model.CopyFrom(backbone)
     joined = [node for node in _before_boxes(model) if node.op_type == "Concat" or node.output[0] == JOINED]
@@ -90,7 +90,7 @@ def _with_output(backbone: onnx.ModelProto, elem_type: int) -> tuple[onnx.ModelP
 
 
 def _before_boxes(model: onnx.ModelProto) -> list[onnx.NodeProto]:
-    """What the head's boxes are computed from, in order: masks of active cells are joined too, but for scores alone."""
+    """Return the nodes that the head's boxes depend on, in order; masks of active cells only affect scores."""
     wanted = {value.name for value in model.graph.output if value.name != "scores"}
     found = []
     for node in reversed(model.graph.node):
@@ -101,7 +101,7 @@ def _before_boxes(model: onnx.ModelProto) -> list[onnx.NodeProto]:
 
 
 def _in_float(model: onnx.ModelProto, steps: str) -> onnx.NodeProto:
-    """As the head's product reads the steps, in a node of its own: the other one is fused with that product."""
+    """Return a new node that dequantizes the steps as the head's product does: the existing one is fused with it."""
     for node in model.graph.node:
         if node.op_type == "DequantizeLinear" and node.input[0] == steps:
             return helper.make_node("DequantizeLinear", [steps, *node.input[1:]], ["neck.values"], name="neck.values")
@@ -143,11 +143,11 @@ class BundleFirstStage:
 
     @property
     def spec(self) -> DetectorSpec:
-        """Of the bundle."""
+        """Spec of the bundle."""
         return self._pipeline.spec
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Sent to another process, it is opened there: onnxruntime's sessions cannot be sent."""
+        """Pickle as its source, from which the other process opens it: onnxruntime's sessions cannot be pickled."""
         bundle, threads, precision = self._source
         return partial(BundleFirstStage, threads=threads, precision=precision), (bundle,)
 
@@ -163,7 +163,7 @@ def is_checkpoint(source: str) -> bool:
 
 
 def open_exported(source: str) -> FirstStage:
-    """The first stage that a second one was trained on, of a bundle its graphs, which need no weights beside them.
+    """Open the exported form of the first stage that a second one was trained on; graphs suffice, without weights.
 
     Raises:
         AscaError: it is missing, damaged, of another family or not in float32.

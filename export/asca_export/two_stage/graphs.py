@@ -20,7 +20,7 @@ from asca_pillars.ops.two_stage.prepare import RefineSettings
 
 
 class _Layers(nn.Module):
-    """The layers of a trained `SetAbstraction` with their normalization in them; it stays as it is."""
+    """The layers of a trained `SetAbstraction` with their normalization in them; not modified."""
 
     def __init__(self, trained: SetAbstraction) -> None:
         super().__init__()
@@ -30,31 +30,31 @@ class _Layers(nn.Module):
         self.out_channels = trained.out_channels
 
     def after_first(self, pairs: Tensor) -> Tensor:
-        """Outputs of the first layer -> those of the last one before its shift, both (pairs, channels)."""
+        """Apply the layers after the first, up to the last one's shift: (pairs, channels) -> (pairs, channels)."""
         for layer in self.layers[1:-1]:
             pairs = layer(torch.relu(pairs))
         return torch.relu(pairs) @ self.last.weight.T if len(self.layers) > 1 else pairs
 
     def first_shift(self) -> Tensor | None:
-        """None if it is the last one's."""
+        """Return the first layer's bias; None if that layer is the last one too."""
         return self.first.bias if len(self.layers) > 1 else None
 
 
 class GatheredSetAbstraction(_Layers):
-    """For balls whose points have been gathered. Points have fewer channels than the first layer's output."""
+    """Set abstraction on balls whose points have been gathered; points have fewer channels than the first output."""
 
     def forward(self, _positions: None, _features: None, _queries: Tensor, balls: Tensor) -> Tensor:
-        """[p_j - q ; f_j] of each ball, (Q, T, 3 + C), zeros for nothing -> (Q, out_channels)."""
+        """Aggregate [p_j - q ; f_j] of each ball, (Q, T, 3 + C), zeros for empty entries, -> (Q, out_channels)."""
         pairs = F.linear(balls.flatten(0, 1), self.first.weight, self.first_shift())
         largest = self.after_first(pairs).unflatten(0, balls.shape[:2]).amax(dim=1)
         return torch.relu(largest + self.last.bias)
 
 
 class GroupedSetAbstraction(_Layers):
-    """For balls in groups (`ops.points.ball_layouts`): the first layer runs once for each point and each query."""
+    """Set abstraction on grouped balls (`ops.points.ball_layouts`): the first layer runs once per point and query."""
 
     def forward(self, positions: Tensor, features: Tensor, queries: Tensor, balls: GroupedBalls[Tensor]) -> Tensor:
-        """As `SetAbstraction.forward`: (Q, out_channels)."""
+        """Compute `SetAbstraction.forward`: (Q, out_channels)."""
         # Both get a row for nothing: zeros, and the first layer's shift alone.
         points = F.pad(torch.cat([positions, features], dim=1), (0, 0, 0, 1)) @ self.first.weight.T
         away = F.linear(F.pad(queries, (0, 0, 0, 1)), -self.first.weight[:, :3], self.first_shift())
@@ -75,7 +75,7 @@ M = TypeVar("M", bound=nn.Module)
 
 
 class Shift(nn.Module):
-    """What is left of a normalization whose scale has gone into the weights before it: (rows, C) + (C,)."""
+    """Shift of a normalization whose scale is folded into the preceding weights: (rows, C) + (C,)."""
 
     def __init__(self, shift: Tensor) -> None:
         super().__init__()
@@ -87,7 +87,7 @@ class Shift(nn.Module):
 
 
 def fold_norms(network: M) -> M:
-    """A copy without normalization of point features that computes the same in evaluation mode."""
+    """Return a copy without normalization of point features that computes the same in evaluation mode."""
     folded = copy.deepcopy(network).eval()
     with torch.no_grad():
         for module in folded.modules():
@@ -128,7 +128,7 @@ class _Flat(nn.Module):
         self.refiner, self.settings, self.inputs = fast, settings, inputs
 
     def forward(self, *inputs: Tensor) -> tuple[Tensor, Tensor]:
-        """(R,) confidence logits and (R, 7) residuals."""
+        """Return (R,) confidence logits and (R, 7) residuals."""
         named: Any = dict(zip(self.inputs, inputs, strict=True))
         keypoints = named["keypoints"]
         balls = [named[f"ball_{number}"] for number in range(len(self.settings.ball_radii_m))]

@@ -1,4 +1,4 @@
-"""The proof that a bundle of two stages is the trained model: graph by graph on the same inputs, then the boxes."""
+"""Parity of a bundle of two stages and the trained model: graph by graph on the same inputs, then the boxes."""
 
 from collections.abc import Sequence
 
