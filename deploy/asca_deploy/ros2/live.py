@@ -80,7 +80,6 @@ class Live:
         self._frame_id: str | None = None  # frame of the scans whose transform is used
         self._scale: float | None = None
         self._scale_scans = 0
-        self._is_answering = False
         self._working_since: float | None = None
         self.health = Health()
         self._mounting = reading.stated_mounting()
@@ -110,25 +109,24 @@ class Live:
             return
         self._queue.put(points, _Taken(stamp, at_s))
         self.health.dropped = self._queue.dropped
-        if self._is_answering and self._working_since is None:
-            self._working_since = at_s
 
     def run(self) -> None:
         """Answer scans until `close`; errors are raised, and recorded in `health.failure`."""
         try:
             if not self._is_stated and not self._find_mounting():
                 return
-            self._is_answering, before = True, self._queue.taken
-            for count, found in enumerate(self._detector.stream(self._queue), start=1):
+            for points in self._queue:
                 taken: _Taken = self._queue.next_tag()
-                stamp = taken.stamp
+                self._working_since = monotonic()
+                # One scan at a time: a stream would take two more ahead, which answers more scans, each later.
+                found = self._detector(points)
                 boxes: ScanDetections | Tracks = found
                 if self._tracker is not None:
-                    boxes = self._tracker(found, stamp.seconds or taken.at_s)
-                self._answer(stamp, boxes)
+                    boxes = self._tracker(found, taken.stamp.seconds or taken.at_s)
+                self._answer(taken.stamp, boxes)
                 names = boxes.detections.names if isinstance(boxes, Tracks) else boxes.names
                 self.health.answer(1e3 * (monotonic() - taken.at_s), names, found.report.warnings)
-                self._working_since = monotonic() if self._queue.taken - before > count else None
+                self._working_since = None
         except BaseException as error:
             self.health.failure = str(error) or type(error).__name__
             raise
