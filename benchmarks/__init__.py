@@ -1,1 +1,1 @@
-"""Commands that measure this project; a package, or the `benchmarks` that pyarrow 17 installs would hide them."""
+"""Benchmarks of this project; a package, since the `benchmarks` installed by pyarrow 17 would hide plain modules."""

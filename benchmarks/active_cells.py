@@ -1,9 +1,9 @@
-"""What a sparse neck computes and what it leaves out: active cells, and positive anchors that stay among them.
+"""Active cells of a sparse neck, and the positive anchors among them.
 
     python -m benchmarks.active_cells FOLDER                 # KITTI layout, labelled
     python -m benchmarks.active_cells FOLDER --split training --whole-scans
 
-Shares are of all frames together; the time is process time of the table builder, the best of three for each frame.
+Fractions are over all frames; the time is process time of the rulebook builder, the best of three for each frame.
 """
 
 import time
@@ -70,7 +70,7 @@ def _count(
     boxes: NDArray[np.float32],
     labels: NDArray[np.int64],
 ) -> tuple[int, int, int, int, int, float, list[float]]:
-    """Positive anchors, those active, objects, those without any, head cells, milliseconds, active share by level."""
+    """Return positive anchors, active ones, objects, objects without any, head cells, ms, active fraction by level."""
     pillars = spec.pillarize(points)
     pooled = map_cells(pillars.cells, spec.grid)
     cells = pillars.cells if pooled is None else pooled.cells

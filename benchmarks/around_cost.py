@@ -1,9 +1,9 @@
-"""What a mounting and looking in every direction cost: CPU time of each over that of the plain scan, in turn.
+"""Cost of a mounting and of detection in every direction: CPU time relative to that of the plain scan, in turn.
 
     python -m benchmarks.around_cost data/around/training/velodyne
 
-The time is that of the process' own work, of all threads: a busy machine does not change it. What turns the points may
-not wake other threads than those of the network, or it shows here: a mounting costs what its turn costs, some percent,
+The time is CPU time of all threads of the process, so other load has little effect. If rotating the points woke
+threads other than the network's, it would show here: a mounting costs some percent,
 and every direction as many times as there are passes.
 """
 
@@ -37,7 +37,7 @@ def main(
     for path in find_scans(scans)[:frames]:
         points = read_scan(path).points
         times_ms.append([_timed_ms(detector, points) for detector in detectors.values()])
-    table = np.array(times_ms[1:])  # the first scan warms up
+    table = np.array(times_ms[1:])  # the first scan is the warm-up
     ratios = table / table[:, :1]
     print(f"{len(table)} scans, {threads} threads, CPU time of a scan")
     for (name, detector), times, ratio in zip(detectors.items(), table.T, ratios.T, strict=True):

@@ -1,9 +1,9 @@
-"""The files of this project that a scan passes through from its file to the boxes.
+"""Files of this project that a scan passes through from its file to the boxes.
 
     python -m benchmarks.call_path [SCAN] [--bundle BUNDLE]
 
-A file counts if at least one of its functions is called; the detector is open and has seen a scan before. Loops that
-numba compiles stand in files of their own (`*_kernels.py`), as a second form of a function of the file that calls them.
+A file counts if at least one of its functions is called, in a detector after its first scan. Compiled
+numba loops are in files of their own (`*_kernels.py`), as a second form of a function of the calling file.
 """
 
 import sys
@@ -38,7 +38,7 @@ def main(
 
 
 def called_functions(detector: Detector, scan: Path) -> Counter[tuple[str, str]]:
-    """(file, function) of this project -> calls, from reading the scan to its boxes."""
+    """Count the calls of (file, function) of this project from reading the scan to its boxes."""
     calls: Counter[tuple[str, str]] = Counter()
 
     def count(frame: FrameType, event: str, _: Any) -> None:
@@ -46,7 +46,7 @@ def called_functions(detector: Detector, scan: Path) -> Counter[tuple[str, str]]
         if event == "call" and any(path.is_relative_to(root) for root in ROOTS):
             calls[path.name, frame.f_code.co_name] += 1
 
-    detector(read_scan(scan).points)  # tables that are made once
+    detector(read_scan(scan).points)  # creates cached tables
     sys.setprofile(count)
     try:
         detector(read_scan(scan).points)

@@ -1,16 +1,16 @@
-"""Does a cluster find what one process finds, also if a machine of it dies, and what does it cost?
+"""Equality of a cluster's results with those of one process, also after a node's failure, and the cluster's cost.
 
     python -m benchmarks.cluster                       # 2,000 tiny scans, 60 simulated frames
     python -m benchmarks.cluster --scans 200 --frames 0
 
 Two Ray nodes of one CPU each run on this machine. `asca detect` and `asca simulate` are run by one process, on the
 cluster undisturbed, and on the cluster while the second node is killed (SIGKILL, its workers with it) when half of the
-work is there. What is written has to be the same bytes each time. Scans have 300 points and the model has random
-weights and a tiny grid, so that the cost of the cluster is not lost beside that of the network.
+work is done. The output must be the same bytes each time. Scans have 300 points and the model has random
+weights and a tiny grid, so that the network's time does not hide the cluster's.
 
-Costs are processor time, of the command, of the workers (with their start) and of Ray's own processes, looked at 20
-times a second. The work itself is what a worker does for a shard, measured in this process: read, detect, write. What
-the undisturbed run takes beyond it is the cost of the cluster; one more scan costs what the run costs more than a run
+Costs are processor time, of the command, of the workers (with their start) and of Ray's own processes, sampled 20
+times a second. The work itself is a worker's job for a shard, measured in this process: read, detect, write. The
+remaining time of the undisturbed run is the cost of the cluster; the cost of one more scan is the difference to a run
 over a quarter of the scans, in the command and the workers.
 """
 
@@ -43,13 +43,13 @@ from tests.deploy.conftest import make_scan, write_bundle
 POINTS = 300
 POLL_S = 0.05
 NODE = {"num_cpus": 1, "object_store_memory": 80 * 2**20, "include_dashboard": False}
-AT_WORK = "ray::_on_worker"  # what a worker's process is called while it is at a shard
+AT_WORK = "ray::_on_worker"  # name of a worker's process while it runs a shard
 _TICKS = os.sysconf("SC_CLK_TCK")
 
 
 @dataclass
 class Run:
-    """A command that ran: seconds of processor time by kind of process, seconds of wall time, and what it printed."""
+    """Finished command: seconds of processor time by kind of process, seconds of wall time, and its output."""
 
     cpu_s: dict[str, float]
     wall_s: float
@@ -57,7 +57,7 @@ class Run:
 
 
 class CpuMeter:
-    """Processor time of all processes below this one, also of those that have ended: workers, Ray's own, others."""
+    """Meter of the processor time of all child processes, including ended ones: workers, Ray's own, others."""
 
     def __enter__(self) -> "CpuMeter":
         self._first, self._last = self._look(), dict[tuple[str, int, int], float]()
@@ -73,7 +73,7 @@ class CpuMeter:
 
     @property
     def seconds(self) -> dict[str, float]:
-        """Since the block was entered, by kind."""
+        """Return the seconds since the start of the block, by kind."""
         sums = dict.fromkeys(("command", "workers", "Ray"), 0.0)
         for process, seconds in self._last.items():
             sums[process[0]] += seconds - self._first.get(process, 0.0)
@@ -103,7 +103,7 @@ def _is_worker(command_line: str) -> bool:
 
 
 def _processes_below(root: int) -> dict[int, list[str]]:
-    """Processes that descend from `root`: what /proc/ID/stat says after their names."""
+    """Return the processes that descend from `root`, with the fields of /proc/ID/stat after their names."""
     stats = {}
     for path in Path("/proc").glob("[0-9]*/stat"):
         with contextlib.suppress(OSError):  # it has ended
@@ -122,7 +122,7 @@ def _command_line(number: int) -> str:
 
 
 def _kill_at_work(cluster: Any, node: Any) -> bool:
-    """Kill a node while a worker of it is at a shard; False, and nothing done, if none is just now."""
+    """Kill a node while one of its workers runs a shard; return False, without action, if none does."""
     raylet = node.all_processes["raylet"][0].process.pid
     for number in _processes_below(raylet):
         if _command_line(number).startswith(AT_WORK):
@@ -235,7 +235,7 @@ def _simulate(cluster: Any, root: Path, frames: int, console: Console) -> dict[s
 
 
 def _run(arguments: list[str], kill: Callable[[], bool] | None = None) -> Run:
-    """Run `asca ARGUMENTS`, and `kill` again and again until it says that it has killed.
+    """Run `asca ARGUMENTS`, and `kill` repeatedly until it returns True.
 
     Raises:
         RuntimeError: the command failed, or ended before the kill.
@@ -268,7 +268,7 @@ def _files(folder: Path) -> dict[str, bytes]:
 
 
 def _left(folder: Path) -> list[Path]:
-    """Temporary files of the writers that were killed."""
+    """Return temporary files of killed writers."""
     return list(folder.rglob(".*.asca-*"))
 
 

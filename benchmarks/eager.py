@@ -1,12 +1,12 @@
-"""How much faster the runtime is than the same network in eager PyTorch, float32, with padded pillars.
+"""Speed of the runtime relative to the same network in eager PyTorch, float32, with padded pillars.
 
     python -m benchmarks.eager                                  # the paper's size, random weights, float32
     python -m benchmarks.eager --int8 --tolerance 1             # the same in 8 bits
     python -m benchmarks.eager scan.bin --checkpoint last.ckpt --bundle my_int8_bundle --provider openvino --tolerance 5
 
-Both sides get the same scans and number of threads and take turns, points in, boxes out. First the head maps of both
-are compared, so that it is the same network. PyTorch runs in inference mode, float32, with its defaults and its threads
-set; three forms, the customary one first and the two things that an attentive user would change after it.
+Both sides get the same scans and number of threads and run in turn, points in, boxes out. First the head maps of both
+are compared, to verify that the network is the same. PyTorch runs in inference mode, float32, with its defaults and
+its threads set; in three forms, the usual one first, then two common optimizations.
 """
 
 import copy
@@ -63,7 +63,7 @@ def main(
 ) -> None:
     """Compare and print one table."""
     console = Console(markup=False, highlight=False)
-    logging.getLogger("asca_pillars").setLevel(logging.ERROR)  # it may be any scan
+    logging.getLogger("asca_pillars").setLevel(logging.ERROR)  # any scan may be given
     threads = default_threads() if threads is None else threads
     torch.set_num_threads(threads)
     points = [read_scan(path).points for path in find_scans(sample_scan_path() if scans is None else scans)]
@@ -115,7 +115,7 @@ def _forms(model: Checkpoint) -> dict[str, PaddedDetector]:
 
 
 def map_difference(runtime: Detector, form: PaddedDetector, scans: Scans) -> tuple[float, float]:
-    """Largest absolute difference of any head map over the scans, and the smallest standard deviation of a map."""
+    """Return the largest difference of any head map over the scans, and the smallest standard deviation of a map."""
     worst, spread = 0.0, np.inf
     for points in scans:
         maps = runtime.pipeline.infer(runtime.pipeline.prepare(points, []), []).maps

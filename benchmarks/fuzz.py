@@ -1,10 +1,10 @@
-"""Every reader against damaged input: scans, recordings, settings, labels, calibrations, predictions, manifests.
+"""Fuzzing of every reader: scans, recordings, settings, labels, calibrations, predictions, manifests.
 
     python -m benchmarks.fuzz --minutes 20 --seed 7
 
-Valid small files are changed at random (bits, bytes, numbers, pieces left out, repeated, swapped between files) and
-read as a command would. Reading has to succeed or to be refused with one AscaError. The exit code is 1 if anything else
-happened; what did is printed with the number of the input, and `--first NUMBER --inputs 1` reads that one again.
+Valid small files are changed at random (bits, bytes, numbers; pieces removed, repeated, swapped between files) and
+read as by a command. Reading has to succeed or to raise one AscaError. The exit code is 1 if anything else
+happened; it is printed with the number of the input, and `--first NUMBER --inputs 1` reads that one again.
 """
 
 import math
@@ -44,7 +44,7 @@ _WORDS = (
 
 
 class _Slow(BaseException):
-    """Reading took too long."""
+    """Timeout of reading."""
 
 
 def main(
@@ -55,7 +55,7 @@ def main(
     kind: Annotated[str | None, typer.Option(help="Only kinds whose name contains this.")] = None,
     out: Annotated[Path | None, typer.Option("--json", help="Also write the counts to this file.")] = None,
 ) -> None:
-    """Read damaged files, count what came of it."""
+    """Read damaged files and count the outcomes."""
     console = Console(markup=False, highlight=False)
     start = time.perf_counter()
     with tempfile.TemporaryDirectory(prefix="asca-fuzz-") as folder:
@@ -104,7 +104,7 @@ def fuzz(
             kind = chosen[int(rng.choice(len(chosen), p=shares / shares.sum()))]
             content = damaged(kind, rng)
             outcome, text = read(kind, content)
-            if outcome == "slow":  # once more: a busy machine may have stopped it
+            if outcome == "slow":  # repeated, since a busy machine may have delayed it
                 outcome, text = read(kind, content)
             counts[kind.name, outcome] += 1
             if outcome in BAD:
@@ -116,7 +116,7 @@ def fuzz(
 
 
 def damaged(kind: Kind, rng: np.random.Generator) -> bytes:
-    """One of the kind's valid files with one to four random changes."""
+    """Return one of the kind's valid files with one to four random changes."""
     content = bytearray(kind.seeds[rng.integers(len(kind.seeds))])
     for _ in range(rng.integers(1, 5)):
         start, stop = sorted(rng.integers(0, len(content) + 1, 2).tolist())
@@ -144,7 +144,7 @@ def damaged(kind: Kind, rng: np.random.Generator) -> bytes:
 
 
 def read(kind: Kind, content: bytes) -> tuple[str, str]:
-    """What came of reading `content` as a file of a kind, and a description if it should not have."""
+    """Read `content` as a file of a kind; return the outcome, and a description if it is wrong."""
     kind.path.parent.mkdir(exist_ok=True)
     kind.path.write_bytes(content)
     start = time.perf_counter()
@@ -186,7 +186,7 @@ def _finite(value: Any) -> bool:
 
 @contextmanager
 def _alarm() -> Iterator[None]:
-    """Raise `_Slow` in what runs longer than SLOW_S."""
+    """Raise `_Slow` after SLOW_S."""
 
     def ring(_number: int, _frame: FrameType | None) -> None:
         raise _Slow

@@ -1,4 +1,4 @@
-"""What `benchmarks.fuzz` starts from: one reader after the other, with small files that it accepts."""
+"""Seeds of `benchmarks.fuzz`: all readers, with small files that they accept."""
 
 import json
 from collections.abc import Callable
@@ -44,7 +44,7 @@ METADATA = """rosbag2_bagfile_information:
 
 @dataclass(frozen=True)
 class Kind:
-    """A kind of input: the file to write, contents that are valid, and what reads it and returns its numbers."""
+    """Kind of input: the file to write, valid contents, and its reader, which returns its numbers."""
 
     name: str
     path: Path
@@ -55,7 +55,7 @@ class Kind:
 
 
 def kinds(folder: Path) -> list[Kind]:
-    """Every kind of input that a user can hand to a command; the files of each are written below `folder`."""
+    """Return every kind of input of a command; the files of each are written below `folder`."""
     training = folder / "root" / "training"
     for name in ("velodyne", "label_2", "calib"):
         (training / name).mkdir(parents=True, exist_ok=True)
@@ -131,27 +131,27 @@ def kinds(folder: Path) -> list[Kind]:
 
 
 def frame_boxes(path: Path) -> Any:
-    """The boxes and the time of a file of one frame."""
+    """Read the boxes and the time of a file of one frame."""
     return read_frame_file(path).boxes, read_time(path)
 
 
 def named_boxes(path: Path) -> Any:
-    """The boxes of a file of several frames."""
+    """Read the boxes of a file of several frames."""
     return [frame.records.boxes for frame in read_frames(path)]
 
 
 def rosbag2(path: Path) -> Any:
-    """The scans of the folder that a metadata.yaml lies in."""
+    """Read the scans of the folder of a metadata.yaml."""
     return read_recording(path.parent)
 
 
 def read_points(path: Path) -> Any:
-    """The points of a scan."""
+    """Read the points of a scan."""
     return read_scan(path).points
 
 
 def scan_seeds() -> dict[str, tuple[bytes, ...]]:
-    """Small valid scans of each format and encoding, by suffix."""
+    """Return small valid scans of each format and encoding, by suffix."""
     points = np.random.default_rng(0).uniform((-50, -50, -2, 0), (50, 50, 2, 1), (6, 4)).astype("<f4")
     rings = np.column_stack([points, [0, 1, 2, 3, 4, 5]]).astype("<f4")
     rows = "".join(" ".join(f"{value:.3f}" for value in point) + "\n" for point in points).encode()
@@ -186,7 +186,7 @@ def scan_seeds() -> dict[str, tuple[bytes, ...]]:
 
 
 def _bundle(folder: Path) -> Path:
-    """A bundle of links to the graphs that ship, with a manifest that can be damaged."""
+    """Create a bundle of links to the shipped graphs, with a manifest that can be damaged."""
     folder.mkdir(exist_ok=True)
     for path in default_bundle_path().iterdir():
         if path.suffix == ".onnx" and not (folder / path.name).exists():
@@ -201,7 +201,7 @@ def _manifest(path: Path) -> Any:
 
 
 def _sections(text: str) -> list[tuple[str, str]]:
-    """The top-level sections of a YAML text: smaller files are read faster, and a change hits more of what counts."""
+    """Return the top-level sections of a YAML text: smaller files are faster to read and more of them matters."""
     parts = ("\n" + text).split("\n")
     starts = [i for i, line in enumerate(parts) if line and not line.startswith((" ", "-"))]
     whole = ["\n".join(parts[a:b]) for a, b in zip(starts, [*starts[1:], len(parts)], strict=True)]
@@ -209,6 +209,6 @@ def _sections(text: str) -> list[tuple[str, str]]:
 
 
 def _numbers(config: Config) -> Any:
-    """The numbers of a config, and those of the grid that follow from it."""
+    """Return the numbers of a config, and those of its grid."""
     spec = config.model.spec
     return to_dict(config), spec.anchors.shape[:2] if isinstance(spec, VoxelSpec) else (spec.grid.nx, spec.grid.ny)

@@ -1,4 +1,4 @@
-"""Small valid recordings of each kind for `benchmarks.fuzz`, and what reads them."""
+"""Small valid recordings of each kind for `benchmarks.fuzz`, and their reader."""
 
 import io
 import sqlite3
@@ -24,7 +24,7 @@ CREATE INDEX timestamp_idx ON messages (timestamp ASC);"""
 
 
 def recording_seeds() -> dict[str, tuple[bytes, ...]]:
-    """Recordings of three scans and three poses, by suffix."""
+    """Return recordings of three scans and three poses, by suffix."""
     import zstandard
 
     mcaps, databases = _mcaps(), _databases()
@@ -38,7 +38,7 @@ def recording_seeds() -> dict[str, tuple[bytes, ...]]:
 
 
 def read_recording(path: Path) -> Any:
-    """The points of all scans, their times, and the poses, of every topic that may hold any."""
+    """Read the points of all scans, their times, and the poses, of every topic that may have any."""
     recording = open_recording(path)
     found: list[Any] = []
     for topic in recording.topics:
@@ -56,7 +56,7 @@ def read_recording(path: Path) -> Any:
 
 
 def _messages(ros1: bool = False) -> list[tuple[str, int, bytes]]:
-    """(topic, time, data) of scans and poses in turn."""
+    """Return (topic, time, data) of alternating scans and poses."""
     store = _store(ros1)
     serialize = store.serialize_ros1 if ros1 else store.serialize_cdr
     rng = np.random.default_rng(0)
@@ -64,7 +64,7 @@ def _messages(ros1: bool = False) -> list[tuple[str, int, bytes]]:
     for number in range(_SCANS):
         time_ns = (number + 1) * 10**8
         points = rng.uniform((-50, -50, -2, 0), (50, 50, 2, 1), (6, 4)).astype(np.float32)
-        cloud = point_cloud2(store, time_ns if number else 0, points)  # one without a stamp of its own
+        cloud = point_cloud2(store, time_ns if number else 0, points)  # one without a time stamp
         messages.append((TOPIC, time_ns, bytes(serialize(cloud, TYPE))))
         messages.append((ODOMETRY_TOPIC, time_ns, bytes(serialize(_odometry(store, time_ns), ODOMETRY))))
     return messages
@@ -96,7 +96,7 @@ def _store(ros1: bool) -> Any:
 
 
 def _mcaps() -> tuple[bytes, ...]:
-    """With checksums and without: behind one that fits, a change of the content is never reached."""
+    """Return files with and without checksums: with a checksum, changed contents are never decoded."""
     from mcap.writer import CompressionType, IndexType
 
     return (
@@ -126,7 +126,7 @@ def _mcap(**options: Any) -> bytes:
 
 
 def _databases() -> tuple[bytes, ...]:
-    """With messages as they are, and compressed."""
+    """Return files with plain and with compressed messages."""
     import zstandard
 
     found = []

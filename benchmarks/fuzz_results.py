@@ -1,9 +1,9 @@
-"""Damage what commands write and read again: journals, shards, pages of bundles, boxes, marks of folders.
+"""Fuzzing of files that commands write and read again: journals, shards, pages of bundles, boxes, marks of folders.
 
     python -m benchmarks.fuzz_results --inputs 40000 --seed 7
 
-Valid small files are changed at random, as by `benchmarks.fuzz`, and given to what goes on from them. That has to
-succeed with what an undamaged file gives, or refuse with one AscaError and leave the file as it is. Nothing may be
+Valid small files are changed at random, as by `benchmarks.fuzz`, and given to the function that resumes from them. It
+has to succeed with the result of an undamaged file, or raise one AscaError and leave the file unchanged. Nothing may be
 written outside the folder of the file. The exit code is 1 if anything else happened.
 """
 
@@ -58,7 +58,7 @@ from benchmarks.fuzz_inputs import kinds as input_kinds
 LEFT = "left outside"
 OUTCOMES = (*fuzz.OUTCOMES, LEFT)
 READERS = ("config", "override", "manifest", "labels", "predictions")
-"""Kinds of `benchmarks.fuzz` that commands read results and settings by."""
+"""Kinds of `benchmarks.fuzz` with which commands read results and settings."""
 CLASSES = ("Car", "Pedestrian")
 ABOUT = {"recording": "drive.mcap", "files": [["drive.mcap", 1, 2]], "topic": "/lidar", "model": {}, "runs_on": "cpu"}
 BOX = {"x_m": 9.5, "y_m": 1, "z_m": -1, "length_m": 4, "width_m": 2, "height_m": 1.5, "yaw_rad": 0.1}
@@ -71,7 +71,7 @@ def main(
     first: Annotated[int, typer.Option(min=0, help="Number of the first input.")] = 0,
     kind: Annotated[str | None, typer.Option(help="Only kinds whose name contains this.")] = None,
 ) -> None:
-    """Give damaged files to what goes on from them, count what came of it."""
+    """Resume from damaged files and count the outcomes."""
     console = Console(markup=False, highlight=False, width=140)
     start = time.perf_counter()
     with tempfile.TemporaryDirectory(prefix="asca-fuzz-") as folder:
@@ -95,13 +95,13 @@ def fuzz_results(
     only: str | None = None,
     console: Console | None = None,
 ) -> tuple[Counter[tuple[str, str]], list[str]]:
-    """Give damaged files to what goes on from them; counts and failures as of `fuzz.fuzz`."""
-    place = folder / "some" / "where" / "below"  # a path that leads upwards stays in what is compared
+    """Resume from damaged files; return counts and failures as `fuzz.fuzz`."""
+    place = folder / "some" / "where" / "below"  # paths that lead upwards stay within the compared folder
     place.mkdir(parents=True)
     chosen = [kind for kind in kinds(place) if only is None or only in kind.name]
     shares = np.array([kind.share for kind in chosen])
     for kind in chosen:
-        fuzz.read(kind, kind.seeds[0])  # what is made on first use
+        fuzz.read(kind, kind.seeds[0])  # creates caches on first use
     counts: Counter[tuple[str, str]] = Counter()
     failures: list[str] = []
     with Progress(console=console, transient=True, disable=console is None) as progress:
@@ -119,13 +119,13 @@ def fuzz_results(
 
 
 def kinds(folder: Path) -> list[Kind]:
-    """Every kind of result that a command goes on from; the files of each are written below `folder`."""
+    """Return every kind of result that a command resumes from; the files of each are written below `folder`."""
     readers = [kind for kind in input_kinds(folder / "readers") if kind.name in READERS]
     return [*readers, *_gone_on_from(folder), *_boxes(folder), _page(folder), *_marks(folder)]
 
 
 def _gone_on_from(folder: Path) -> list[Kind]:
-    """Journals and shards: what is whole is kept, the rest done again, and the results are the undamaged ones."""
+    """Return kinds of journals and shards: intact parts are kept, others recomputed, and the results are unchanged."""
     rng = np.random.default_rng(0)
     results = []
     for number in range(SCANS):
@@ -208,15 +208,15 @@ def _boxes(folder: Path) -> list[Kind]:
 
 
 def read_boxes(path: Path) -> Any:
-    """The boxes of a frame's own file."""
+    """Read the boxes of a frame's own file."""
     return read_frame_file(path).boxes
 
 
 def _page(folder: Path) -> Kind:
-    """bundle.json of a stranger, of which a page is made."""
+    """Return the kind of a foreign bundle.json, from which a page is made."""
     source, bundle, package = shipped_bundles()["asca_small_sim_int8"], folder / "bundle", folder / "onnxruntime-web"
     bundle.mkdir()
-    for name in ("encoder.onnx", "backbone.onnx", "main.js", "index.html", "x.mjs"):  # names that a stranger may choose
+    for name in ("encoder.onnx", "backbone.onnx", "main.js", "index.html", "x.mjs"):  # names in a foreign bundle
         graph = "encoder" if name == "encoder.onnx" else "backbone"
         (bundle / name).symlink_to(source / f"{graph}.onnx")
     (package / "dist").mkdir(parents=True)
@@ -245,7 +245,7 @@ def _page(folder: Path) -> Kind:
 
 
 def _marks(folder: Path) -> list[Kind]:
-    """Marks, which show that a folder or file is a command's own; looking at one never changes it."""
+    """Return kinds of marks, which identify a command's own folder or file; checking one never changes it."""
     picture = png_bytes(np.zeros((4, 4, 3), np.uint8))
     scan = json.dumps({"scan": "1.bin", "frame": "", "boxes": [], "points_not_finite": 0}).encode()
     report = json.dumps({"subject": "", "frames_asked": 1, "results": 1, "bands": [], "operating_points": []}).encode()
@@ -313,7 +313,7 @@ def _look(look: Callable[[Path], None], out: Path, _: Path) -> None:
 
 
 def _keeping(look: Callable[[Path], Any], *, always: bool = False) -> Callable[[Path], Any]:
-    """The same, and an error if the file is not what it was after it was refused, or `always`."""
+    """Wrap a function: an error if the file changed after it was refused, or `always`."""
 
     def read(path: Path) -> Any:
         before = path.read_bytes()
@@ -335,7 +335,7 @@ def _require(holds: bool, reason: str) -> None:
 
 
 def _listing(folder: Path, target: Path) -> set[tuple[str, int]]:
-    """Every file below a folder with its size, but those below `target`."""
+    """Return every file below a folder with its size, except those below `target`."""
     found = set()
     for at, names, files in os.walk(folder):
         names[:] = [name for name in names if Path(at, name) != target]

@@ -1,9 +1,9 @@
-"""Write the two graphs with which `asca bench` measures how fast the machine multiplies matrices.
+"""Creation of the two graphs with which `asca bench` measures the machine's matrix multiplication rate.
 
     python -m benchmarks.gemm_graphs
 
-The constant matrix is a small tile repeated: onnxruntime unfolds it when it opens the graph and packs it as it packs a
-network's weights, and the files stay small. MatMulInteger rather than QLinearMatMul: int32 out, no time for rounding.
+The constant matrix is a small tile repeated: onnxruntime expands it when it opens the graph and packs it like a
+network's weights, and the files stay small. MatMulInteger rather than QLinearMatMul: int32 output without rounding.
 """
 
 from pathlib import Path

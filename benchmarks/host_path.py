@@ -1,9 +1,9 @@
-"""What the detector does outside its two graphs, and how long it takes.
+"""Time of the detector's stages outside its two graphs.
 
     python -m benchmarks.host_path [SCANS]...
 
-Medians with the middle half of the rounds, milliseconds. Memory is as after a frame of the network: other data
-has pushed the scan out of the caches.
+Medians and quartiles over the rounds, milliseconds. Caches are as after a frame of the network: other data
+has evicted the scan.
 """
 
 import time
@@ -28,7 +28,7 @@ from asca_pillars.ops.pillar.neck_rulebooks import NeckRulebookBuilder
 from asca_pillars.scans.input_check import check_input
 from asca_pillars.scans.scan_reader import read_scan
 
-CAMERA_VIEW = 0.84, 0.25  # |y| / x and |z| / x: about what KITTI's camera 2 sees
+CAMERA_VIEW = 0.84, 0.25  # |y| / x and |z| / x: approximate field of view of KITTI's camera 2
 DISTURBANCE = np.zeros(4 << 20, np.float32)  # 16 MB
 CANDIDATES = (100, 1000)
 
@@ -50,13 +50,13 @@ def main(
 
 
 def camera_view(points: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Which points (N, >= 3), metres, LiDAR frame, the camera sees: (N,)."""
+    """Return the mask (N,) of points (N, >= 3), metres, LiDAR frame, in the camera's field of view."""
     seen = np.abs(points[:, 1:3]) <= points[:, :1] * np.array(CAMERA_VIEW, np.float32)
     return np.asarray(seen.all(axis=1))
 
 
 def host_path(points: NDArray[np.float32], bundle: PillarBundle) -> dict[str, Callable[[], Any]]:
-    """What one frame asks for, stage by stage; the head's maps are noise in which 60 anchors find something."""
+    """Return the stages of one frame; the head's maps are noise with 60 anchors above the threshold."""
     spec, rng = bundle.spec, np.random.default_rng(0)
     height, width, count, _ = spec.anchors.shape
     scores = rng.normal(-8, 1, (height, width, count)).astype(np.float32)
@@ -79,7 +79,7 @@ def host_path(points: NDArray[np.float32], bundle: PillarBundle) -> dict[str, Ca
 
 
 def suppression(count: int) -> Callable[[], Any]:
-    """Suppression of boxes as large as cars in all directions."""
+    """Return a call of NMS on boxes of the size of cars in all directions."""
     rng = np.random.default_rng(count)
     low, high = [0, -30, -1, 3.5, 1.5, 1.4, -np.pi], [60, 30, -0.5, 4.5, 2.0, 1.8, np.pi]
     boxes, scores = rng.uniform(low, high, (count, 7)).astype(np.float32), rng.random(count).astype(np.float32)
@@ -98,7 +98,7 @@ def report(stages: dict[str, Callable[[], Any]], rounds: int) -> None:
 
 
 def measure_ms(stage: Callable[[], Any]) -> float:
-    """Wall time of one call."""
+    """Return the wall time of one call."""
     np.add(DISTURBANCE, 1, out=DISTURBANCE)
     start = time.perf_counter()
     stage()

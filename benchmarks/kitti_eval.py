@@ -1,9 +1,9 @@
-"""Time and memory of the KITTI evaluation on made-up frames, and how its brute-force reference compares.
+"""Time and memory of the KITTI evaluation on synthetic frames, compared with a brute-force reference.
 
     python -m benchmarks.kitti_eval
 
-As many frames as KITTI's validation split has, with about as many objects; most detections are objects found two or
-three times, as a detector reports them before suppression. The reference does a few of the frames and must agree.
+As many frames as in KITTI's validation split, with about as many objects; most detections are objects detected two or
+three times, as before suppression. The reference evaluates a few of the frames and must agree.
 """
 
 import math
@@ -71,7 +71,7 @@ def main(
 
 
 def _frame(rng: np.random.Generator, number: int, detections: int) -> tuple[FrameObjects, FrameObjects]:
-    """Ground truth and detections of one frame."""
+    """Return ground truth and detections of one frame."""
     objects = 1 + rng.poisson(6)
     kinds = rng.choice(len(TYPES), objects, p=SHARES)
     boxes = _boxes(rng, kinds)
@@ -89,7 +89,7 @@ def _frame(rng: np.random.Generator, number: int, detections: int) -> tuple[Fram
     model = rng.integers(-objects, objects * 2, detections)
     near = (model >= 0) & (model < objects)
     source = np.where(near, model, 0)
-    # What is found is of the model's class where that is one of the classes, and else looks like a car.
+    # Detections have the model's class if it is among the classes, otherwise that of a car.
     others[near] = np.where(kinds[source] < 3, kinds[source], 0)[near]
     reported = _boxes(rng, others)
     noise = rng.normal(0, [0.05, 0.05, 0.15, 0.15, 0.05, 0.2, 0.1], (detections, 7))
@@ -101,7 +101,7 @@ def _frame(rng: np.random.Generator, number: int, detections: int) -> tuple[Fram
 
 
 def _boxes(rng: np.random.Generator, kinds: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Height, width, length, x, y, z and rotation_y of made-up objects on the ground before the camera: (N, 7)."""
+    """Return height, width, length, x, y, z and rotation_y (N, 7) of synthetic objects in front of the camera."""
     count = len(kinds)
     z_m = rng.uniform(5, 70, count)
     x_m = rng.uniform(-0.7, 0.7, count) * z_m
@@ -110,7 +110,7 @@ def _boxes(rng: np.random.Generator, kinds: NDArray[np.int64]) -> NDArray[np.flo
 
 
 def _image_boxes(boxes: NDArray[np.float64]) -> NDArray[np.float64]:
-    """What the camera sees of boxes (N, 7), taken for upright rectangles that face it: (N, 4) pixels."""
+    """Return image boxes of boxes (N, 7), approximated by upright rectangles facing the camera: (N, 4) pixels."""
     height_m, width_m, length_m, x_m, y_m, z_m, rotation_y = boxes.T
     half_m = (np.abs(np.cos(rotation_y)) * length_m + np.abs(np.sin(rotation_y)) * width_m) / 2
     depth_m = np.maximum(z_m, 1.0)

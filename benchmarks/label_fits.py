@@ -1,9 +1,9 @@
-"""How labels lie around points, by drive: the statistics of `asca simulate --report` for any folder in KITTI's layout.
+"""Fit of labels to points, by drive: the statistics of `asca simulate --report` for any folder in KITTI's layout.
 
     python -m benchmarks.label_fits data/kitti 0001 0005 0013      # lists in ImageSets, one drive each
     python -m benchmarks.label_fits data/sim --json fits.json      # all frames; also as the reference file holds them
 
-Drives are sequences: hundreds of boxes are a dozen cars. What is to be believed has to hold on several of them.
+Drives are sequences: hundreds of boxes are a dozen cars. Conclusions have to hold on several of them.
 """
 
 import json

@@ -32,7 +32,7 @@ def main(
 
 
 def stamped_scans(data: Path) -> Iterator[tuple[int, NDArray[np.float32]]]:
-    """Time in nanoseconds and points (N, 4) of every scan."""
+    """Yield time in nanoseconds and points (N, 4) of every scan."""
     split = BoxSplit(data)
     for frame_id in split.frame_ids:
         labels = json.loads((split.labels_path / f"{frame_id}.json").read_text(encoding="utf-8"))
@@ -81,7 +81,7 @@ def _write_mcap(out: Path, scans: Iterator[tuple[int, NDArray[np.float32]]]) -> 
 
 
 def point_cloud2(store: Any, time_ns: int, points: NDArray[np.float32]) -> Any:
-    """Points (N, 4), in metres, as a message of the type store."""
+    """Return points (N, 4), in metres, as a message of the type store."""
     types = store.types
     stamp = types["builtin_interfaces/msg/Time"](sec=time_ns // 10**9, nanosec=time_ns % 10**9)
     extra = {"seq": 0} if "seq" in types["std_msgs/msg/Header"].__dataclass_fields__ else {}

@@ -1,14 +1,14 @@
-"""Does the memory of a detector grow with the number of scans?
+"""Growth of a detector's memory with the number of scans.
 
     python -m benchmarks.memory --scans 50000                  # half in calls, half in streams
     python -m benchmarks.memory --scans 50000 --only streams
 
 Scans are crops of the sample of many sizes, so that everything whose size depends on the scan keeps changing. Half of
-them go through single calls and half through streams that are opened and closed again.
+them are detected by single calls and half by streams that are opened and closed again.
 
-Resident memory goes up and down with what the allocator gives back, by some MiB and for each thread's arena on its own,
-so a difference of two moments says little. The crops come again in the same order, and after CYCLE scans also at the
-same places in a stream: compared are the medians of whole cycles. What is kept for ever raises them.
+Resident memory varies with the memory that the allocator returns, by some MiB and separately for each thread's arena,
+so the difference of two samples is not conclusive. The crops repeat in the same order, and after CYCLE scans also at
+the same places in a stream: the medians of whole cycles are compared. Leaks raise them.
 """
 
 import json
@@ -33,9 +33,9 @@ from asca_pillars.cli.run_command import run_command
 from asca_pillars.scans.scan_reader import read_scan
 
 CHUNK = 50  # scans of one stream, then as many single calls
-CROPS = 199  # sizes that come again and again, or allocators would go on finding new ones; prime to CHUNK
+CROPS = 199  # sizes that repeat, so that allocators reach a steady state; coprime to CHUNK
 CYCLE = CHUNK * CROPS
-WARM_SHARE = 0.2  # the allocator and the graphs find their sizes first
+WARM_SHARE = 0.2  # until the sizes of the allocator and the graphs are steady
 
 
 def main(
@@ -47,7 +47,7 @@ def main(
     only: Annotated[Literal["calls", "streams"] | None, typer.Option(help="Default: half of each.")] = None,
     out: Annotated[Path | None, typer.Option("--json", help="Also write the samples to this file.")] = None,
 ) -> None:
-    """Run, sample the resident memory along the way, print what is kept from cycle to cycle, and the slope of all."""
+    """Run, sample the resident memory, print the growth from cycle to cycle, and the slope."""
     console = Console(markup=False, highlight=False)
     logging.getLogger("asca_pillars").setLevel(logging.ERROR)  # crops are unlike any training scan
     detector = Detector(bundle, provider=provider, precision=precision, threads=threads)
@@ -69,10 +69,10 @@ def main(
 
 
 def cycle_levels(counts: NDArray[np.floating], resident: NDArray[np.floating]) -> NDArray[np.floating]:
-    """The median resident memory, MiB, of each cycle of scans; of halves of what there is if it holds less than two.
+    """Return the median resident memory, MiB, of each cycle of scans; of halves if there are less than two cycles.
 
     Args:
-        counts: (N,) scans done at each sample, ascending.
+        counts: (N,) number of scans at each sample, ascending.
         resident: (N,) MiB at each sample.
     """
     cycles = max(2, round(float(counts[-1] - counts[0]) / CYCLE))
@@ -93,7 +93,7 @@ def _run(detector: Detector, count: int, only: str | None, console: Console) -> 
 
 
 def crops(points: NDArray[np.float32]) -> Iterator[NDArray[Any]]:
-    """Without end: CROPS squares of random place and size out of a scan (N, 4), from few points to most, repeated."""
+    """Yield without end CROPS squares of random place and size of a scan (N, 4), repeated."""
     rng = np.random.default_rng(0)
     for x, y, half in cycle(rng.uniform((0, -30, 1), (60, 30, 25), (CROPS, 3)).tolist()):
         yield points[(np.abs(points[:, 0] - x) < half) & (np.abs(points[:, 1] - y) < half)]

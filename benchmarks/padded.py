@@ -1,6 +1,6 @@
-"""The network as PyTorch users run it: every pillar padded to `max_points`, every scan to `max_pillars`, eager float32.
+"""The network in the usual PyTorch form: pillars padded to `max_points`, scans to `max_pillars`, eager float32.
 
-Written from the papers' description of the input tensor, (P, N, 9) with zeros where there is no point, and with the
+Written from the papers' description of the input tensor, (P, N, 9) with zeros for missing points, and with the
 weights of our own model. Our detector keeps the points flat instead; the results are the same.
 """
 
@@ -21,15 +21,15 @@ from asca_pillars.ops.pillar.spec import PillarSpec
 
 @dataclass(frozen=True)
 class PaddedDetector:
-    """A trained network in evaluation mode, run on padded pillars.
+    """Trained network in evaluation mode, run on padded pillars.
 
     Attributes:
-        network: its reading of the attention must not be `point`, which works on points.
-        all_pillars: pad to `max_pillars` as the papers' tensor is; otherwise only to the pillars that are there.
-        channels_last: memory format of the network, which convolutions on a CPU prefer.
+        network: the network; its attention must not be `point`, which works on points.
+        all_pillars: pad to `max_pillars` like the papers' tensor; otherwise only to the number of pillars.
+        channels_last: memory format of the network, faster for convolutions on a CPU.
 
     Raises:
-        ConfigError: the network attends among points.
+        ConfigError: the network has point attention.
     """
 
     network: PillarDetector
@@ -44,13 +44,13 @@ class PaddedDetector:
             )
 
     def __call__(self, points: NDArray[np.float32]) -> Detections:
-        """(N, 4) x, y, z in metres and reflectance -> boxes, best first."""
+        """Detect in (N, 4) x, y, z in metres and reflectance -> boxes, best first."""
         maps = self.head_maps(points)
         return self.spec.decode(HeadMaps(*(part.numpy() for part in maps)))
 
     @torch.inference_mode()
     def head_maps(self, points: NDArray[np.float32]) -> HeadMaps[Tensor]:
-        """(N, 4) -> maps (A, H, W), (7A, H, W), (2A, H, W)."""
+        """Compute the head maps: (N, 4) -> maps (A, H, W), (7A, H, W), (2A, H, W)."""
         pillars = self.spec.pillarize(points)
         table, counts = self._pad(pillars)
         features = self._encode(table, counts)[: len(pillars.cells)]  # (P, C)
@@ -59,7 +59,7 @@ class PaddedDetector:
         return HeadMaps(*(part[0] for part in maps))
 
     def _pad(self, pillars: Pillars) -> tuple[Tensor, Tensor]:
-        """Points of each pillar (P', N, 9), zeros behind them, and how many they are (P',)."""
+        """Return the points of each pillar (P', N, 9), padded with zeros, and their numbers (P',)."""
         found, limits = len(pillars.cells), self.spec.limits
         rows = limits.max_pillars if self.all_pillars else found
         table = np.zeros((rows, limits.max_points, len(FEATURES)), np.float32)
@@ -71,19 +71,19 @@ class PaddedDetector:
         return torch.from_numpy(table), torch.from_numpy(counts)
 
     def _encode(self, table: Tensor, counts: Tensor) -> Tensor:
-        """(P', N, 9) -> (P', C); rows without points are zero."""
+        """Encode pillars: (P', N, 9) -> (P', C); rows without points are zero."""
         encode = self.network.encode
         rows, slots, _ = table.shape
         linear = encode.linear(table)  # (P', N, C)
         points = torch.relu(encode.norm(linear.view(rows * slots, -1))).view(rows, slots, -1)
         real = torch.arange(slots) < counts[:, None]
-        pillars = (points * real[..., None]).amax(dim=1)  # after a ReLU, zero never wins over a real point
+        pillars = (points * real[..., None]).amax(dim=1)  # after a ReLU, zero never exceeds a real point
         if encode.pillar_attention is not None:
             pillars = encode.pillar_attention(pillars)
         return pillars
 
     def _scatter(self, features: Tensor, cells: Tensor) -> Tensor:
-        """(P, C) -> pseudo-image (1, C, ny, nx)."""
+        """Scatter features: (P, C) -> pseudo-image (1, C, ny, nx)."""
         ny, nx = self.spec.grid.ny, self.spec.grid.nx
         canvas = torch.zeros(features.shape[1], ny * nx)
         canvas[:, cells] = features.T

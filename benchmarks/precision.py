@@ -1,8 +1,8 @@
-"""What fewer digits change on given scans: raw head maps and final boxes, against float32 on stock onnxruntime.
+"""Effect of lower precision on given scans: raw head maps and final boxes, against float32 on stock onnxruntime.
 
     python -m benchmarks.precision scans/                # a scan or a folder of them; default: the sample
 
-What that costs in AP says `asca eval` on both bundles; this shows where the difference is.
+For the effect on AP run `asca eval` on both bundles; this shows where the difference arises.
 """
 
 import logging
@@ -47,7 +47,7 @@ def main(
 ) -> None:
     """Print one row for each way to run the network with fewer digits."""
     console = Console(markup=False)
-    logging.getLogger("asca_pillars").setLevel(logging.ERROR)  # it may be any scan
+    logging.getLogger("asca_pillars").setLevel(logging.ERROR)  # any scan may be given
     points = [read_scan(path).points for path in find_scans(sample_scan_path() if scans is None else scans)]
     expected = Detector(reference)
     table = Table("", title=f"{len(points)} scan(s), against {reference} on cpu in float32")
@@ -75,7 +75,7 @@ def main(
 def _column(
     expected: Detector, detector: Detector, scans: Sequence[NDArray[np.float32]], console: Console
 ) -> list[str]:
-    """Values of ROWS."""
+    """Return the values of ROWS."""
     errors = []
     for points in track(scans, "Comparing", console=console, transient=True):
         ours, theirs = _maps(expected, points), _maps(detector, points)
@@ -107,7 +107,7 @@ def _maps(detector: Detector, points: NDArray[np.float32]) -> HeadMaps[NDArray[n
 
 
 def _best_anchors(logits: NDArray[np.float32]) -> tuple[NDArray[np.int64], ...]:
-    """Indices (anchor, row, column) of the best anchors of each class; two anchors belong to one class."""
+    """Return indices (anchor, row, column) of the best anchors of each class; two anchors belong to one class."""
     by_class = logits.reshape(len(logits) // 2, -1)
     best = np.argpartition(-by_class, COMPARED_ANCHORS, axis=1)[:, :COMPARED_ANCHORS]
     flat = best + np.arange(len(best))[:, None] * by_class.shape[1]

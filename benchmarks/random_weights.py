@@ -1,9 +1,9 @@
-"""Bundles of an untrained network, to time it: random weights cost what trained ones do.
+"""Bundles of an untrained network for timing: random weights take as long as trained ones.
 
     python -m benchmarks.random_weights bundles/                                  # the paper's size, K = 3
     asca bench scans/ --bundle bundles/int8 --compare bundles/float32
 
-The weights are the same on every run. How good 8 bits are, they cannot say; neither how many boxes there will be.
+The weights are the same on every run. They show neither the accuracy of 8 bits nor the number of boxes.
 """
 
 from collections.abc import Callable
@@ -62,12 +62,12 @@ def export_random_weights(
 
 
 def random_weights(config: str, points: NDArray[np.float32], neck: Neck | None = None) -> Checkpoint:
-    """A network with random weights, normalized on a scan (N, 4), so that its maps depend on the points.
+    """Return a network with random weights, normalized on a scan (N, 4), so that its maps depend on the points.
 
     Args:
         config: YAML, or the name of one that ships.
-        points: metres, LiDAR frame, and reflectance.
-        neck: in place of the configuration's.
+        points: x, y, z in metres, LiDAR frame, and reflectance.
+        neck: overrides the configuration's.
     """
     torch.manual_seed(0)
     resolved = load_config(config)

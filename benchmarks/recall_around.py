@@ -1,18 +1,18 @@
-"""Does a model that looks ahead find as much behind and beside as ahead, when the scan is turned for it?
+"""Recall by direction of a model that looks ahead, with the scan rotated for each pass.
 
     asca simulate data/around -n 300 --view around --seed 177
     python -m benchmarks.recall_around data/around
 
-Three answers, each with a 95 % interval:
+Three results, each with a 95 % interval:
 
-- recall as it is, by direction;
-- recall like for like: as if in every direction there stood the same objects, by distance, points and occlusion. What
-  remains is how the direction itself is seen;
-- with --turn, the same scans turned before the detector gets them. What then goes with the street and not with the
-  pass is the scene's, what stays with the pass is the method's.
+- recall as measured, by direction;
+- recall for equal objects: weighted as if every direction had the same objects, by distance, points and occlusion. The
+  remaining difference is an effect of the direction itself;
+- with --turn, the same scans rotated before detection. Differences that rotate with the street are of the scene,
+  those that stay with the pass are of the method.
 
-An object counts from FEWEST_POINTS points on, within RANGE_M. It is found if a detection of its class overlaps it by
-`evaluation.recall.BEV_IOU`, seen from above; a detection finds one object.
+Objects with at least FEWEST_POINTS points, within RANGE_M, are counted. One is found if a detection of its class
+overlaps it by `evaluation.recall.BEV_IOU` in bird's-eye view; a detection matches one object.
 """
 
 import math
@@ -51,11 +51,11 @@ class Objects(NamedTuple):
 
     frame: NDArray[np.int64]
     bearing_deg: NDArray[np.float64]
-    """Counter-clockwise from straight ahead of the scan as it was recorded."""
+    """Counter-clockwise from straight ahead in the recorded scan."""
     distance_m: NDArray[np.float64]
     points: NDArray[np.int64]
     occluded: NDArray[np.int64]
-    """KITTI's 0 to 3."""
+    """KITTI's state, 0 to 3."""
     found: _Flags
 
     @property
@@ -65,7 +65,7 @@ class Objects(NamedTuple):
 
     @property
     def stratum(self) -> NDArray[np.int64]:
-        """(N,) equal for objects that are alike in distance, points and occlusion."""
+        """(N,) stratum of distance, points and occlusion."""
         near = np.searchsorted(DISTANCE_STEPS_M, self.distance_m)
         dense = np.searchsorted(POINT_STEPS, self.points, side="right")
         return np.asarray((near * 8 + dense) * 8 + np.minimum(self.occluded, 2))
@@ -77,7 +77,7 @@ def main(
     frames: Annotated[int | None, typer.Option("--frames", "-n", help="Default: all.")] = None,
     turn: Annotated[float, typer.Option(help="Degrees by which every scan is turned before it is detected.")] = 0.0,
 ) -> None:
-    """Print recall by direction, as it is and like for like."""
+    """Print recall by direction, raw and for equal objects."""
     detector = Detector(bundle, view="around")
     split = KittiSplit(data)
     chosen = split.frame_ids[:frames]
@@ -102,7 +102,7 @@ def main(
 def _match(
     split: KittiSplit, frame_id: str, number: int, name: str, points: NDArray[np.float32], boxes: NDArray[np.float32]
 ) -> tuple[Objects, int]:
-    """The objects of a class in one frame, and how many of them more than one detection overlaps."""
+    """Return the objects of a class in one frame, and the number of those overlapped by more than one detection."""
     own = [item for item in objects_3d(split.objects(frame_id)) if item.type == name]
     truth = boxes_from_objects(own, split.calibration(frame_id))
     inside = points_in_boxes(points, truth).sum(axis=0)
@@ -143,13 +143,13 @@ def _table(name: str, objects: Objects) -> str:
 
 
 def _differences(objects: Objects, own: _Flags, ahead: _Flags) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Recall less that ahead, as it is and like for like: each (3,) with its interval over resampled revolutions."""
+    """Return recall minus that ahead, raw and for equal objects: each (3,) with its bootstrap interval."""
     rng = np.random.default_rng(0)
     frames = int(objects.frame.max(initial=0)) + 1
     _, stratum = np.unique(objects.stratum, return_inverse=True)
     raw, alike = [], []
     for repeat in range(REPEATS + 1):
-        drawn = rng.integers(0, frames, frames) if repeat else np.arange(frames)  # the revolutions as they are first
+        drawn = rng.integers(0, frames, frames) if repeat else np.arange(frames)  # first all revolutions once
         each = np.bincount(drawn, minlength=frames).astype(np.float64)[objects.frame]
         raw.append(_recall(objects.found, each * own) - _recall(objects.found, each * ahead))
         alike.append(_alike(objects.found, stratum, each * own, each * ahead))
@@ -161,7 +161,7 @@ def _recall(found: _Flags, weight: NDArray[np.float64]) -> float:
 
 
 def _alike(found: _Flags, stratum: NDArray[np.int64], own: NDArray[np.float64], ahead: NDArray[np.float64]) -> float:
-    """Difference of recall within each stratum that both sides have, averaged over the objects of both."""
+    """Return the difference of recall within each stratum that both sides have, averaged over the objects of both."""
     counts = [np.bincount(stratum, weight) for weight in (own, ahead)]
     hits = [np.bincount(stratum, weight * found) for weight in (own, ahead)]
     both = (counts[0] > 0) & (counts[1] > 0)

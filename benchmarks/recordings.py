@@ -1,12 +1,12 @@
-"""Recordings of simulated sequences through `asca detect --track`: time, dropped scans, what is written, HOTA.
+"""Recordings of simulated sequences through `asca detect --track`: time, dropped scans, output, HOTA.
 
     asca simulate data/drives --sequences 3 --length 200 --view around --seed 11
     python -m benchmarks.recordings data/drives
 
-The sequences become an MCAP and a rosbag2. Each is detected with tracks by one command, whose processor time per scan
-is printed; the MCAP with the boxes is read back by the format's own reader; the tracks are scored. At last the scans
-come at their own pace from a thread of their own, into a ScanQueue that drops what comes too fast, and what was dropped
-is counted: that part depends on what else the machine does.
+The sequences are written as an MCAP and a rosbag2. Each is detected with tracks by one command, whose processor time
+per scan is printed; the MCAP with the boxes is read back by the format's own reader; the tracks are evaluated. Finally
+a thread puts scans at their own rate into a ScanQueue that drops scans on overload, and dropped ones
+are counted: that part depends on other load of the machine.
 """
 
 import json
@@ -41,7 +41,7 @@ def main(
     threads: Annotated[int, typer.Option(help="CPU threads of the detector.")] = 2,
     paced: Annotated[int, typer.Option(help="Scans that come at their own pace.")] = PACED_SCANS,
 ) -> None:
-    """Print a line for each recording, the tracks' scores, and what was dropped."""
+    """Print a line for each recording, the tracks' scores, and the number of dropped scans."""
     print(f"{cpu_model()}, {threads} threads")
     with tempfile.TemporaryDirectory(prefix="asca-recordings-") as temporary:
         folder = Path(temporary)
@@ -83,7 +83,7 @@ def _messages(path: Path) -> int:
 
 
 def _tracker_cost(lines: list[dict[str, Any]]) -> str:
-    """Processor time of the tracker alone, on the boxes that were written."""
+    """Return the processor time of the tracker alone, on the written boxes."""
     names = tuple(sorted({box["class"] for line in lines for box in line["boxes"]}))
     scans = []
     for line in lines:
@@ -101,7 +101,7 @@ def _tracker_cost(lines: list[dict[str, Any]]) -> str:
 
 
 def _paced(data: Path, threads: int, count: int) -> str:
-    """Scans that come at their own pace: how many were dropped."""
+    """Detect in scans that arrive at their own rate; return how many were dropped."""
     queue, detector = ScanQueue("drop"), Detector(threads=threads)
     births = {one.name: one.score_threshold for one in load_pillar_bundle(find_bundle(None)).spec.classes}
     tracker = Tracker(birth_score=births)

@@ -1,4 +1,4 @@
-"""What a trained second stage makes of its first stage's proposals: 3D AP with and without it.
+"""Gain of a trained second stage over its first stage's proposals: 3D AP with and without it.
 
     asca simulate data/sim --frames 4000 --seed 7 --view camera
     asca simulate data/check --frames 300 --seed 2026 --view camera
@@ -9,7 +9,7 @@ or, for PV-RCNN, of an exported bundle:
 
     python -m benchmarks.refine_gain pvrcnn_small_sim data/check
 
-All rows are the same proposals through the same suppression.
+All rows use the same proposals and the same suppression.
 """
 
 import tempfile
@@ -42,7 +42,7 @@ from asca_pillars.models.two_stage.proposal_cache import ProposalCache
 from asca_pillars.ops.two_stage.decode import Scores, refined_detections, refined_scores
 
 Judged = tuple[Detections, tuple[NDArray[np.float32], NDArray[np.float32]]]
-"""The R proposals of a frame, and the second stage's confidence (R,), logits, and residuals (R, 7) for them."""
+"""R proposals of a frame, and the second stage's confidence (R,), logits, and residuals (R, 7) for them."""
 
 
 def main(
@@ -112,7 +112,7 @@ def _pv_rcnn(bundle: Path, frames: KittiSplit) -> tuple[dict[str, Judged], PostP
 def moderate_ap(
     split: KittiSplit, class_names: tuple[str, ...], detections: Callable[[str], Detections]
 ) -> list[float]:
-    """3D AP of each class, moderate, R40, percent."""
+    """Return the 3D AP of each class, moderate, R40, percent."""
     frame_ids = iter(split.frame_ids)
     truth = read_truth(split.folder / "label_2", split.frame_ids)
     with tempfile.TemporaryDirectory() as folder:

@@ -1,11 +1,11 @@
-"""What `asca ros2` answers to a sensor: a process that publishes clouds on /points and times the boxes that come back.
+"""Latency of `asca ros2`: a process that publishes clouds on /points and times the returned boxes.
 
     asca ros2 --topic /points                                        # in another terminal
     python -m benchmarks.ros2_publisher --scans data/around/training/velodyne --count 600 --qos reliable
 
 Latencies are from the call that publishes a scan to the arrival of its boxes in the same process. Prints JSON. Both
-processes need ROS 2 (tests/requirements-ros2.txt); best effort needs FASTDDS_DEFAULT_PROFILES_FILE as docs/LIVE.md
-says.
+processes need ROS 2 (tests/requirements-ros2.txt); best effort needs FASTDDS_DEFAULT_PROFILES_FILE, see
+docs/LIVE.md.
 """
 
 import array
@@ -86,7 +86,7 @@ def main(
 
 
 def _contents(folder: Path | None, points: int) -> "list[array.array[int]]":
-    """Bytes of the clouds."""
+    """Return the bytes of the clouds."""
     if folder is None:
         clouds = [np.random.default_rng(0).uniform([0, -20, -2, 0], [40, 20, 1, 1], (points, 4))]
     else:

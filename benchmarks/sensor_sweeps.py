@@ -1,9 +1,9 @@
-"""A real sweep of another sensor beside simulated ones: returns, ranges, reflectances, and how many lasers return.
+"""Comparison of a real sweep of another sensor with simulated ones: returns, ranges, reflectances, lasers.
 
     python -m benchmarks.sensor_sweeps SWEEP.pcd.bin -c hdl_32e           # nuScenes: float32 x, y, z, intensity, ring
     python -m benchmarks.sensor_sweeps SWEEP.feather -c vlp_32c_pair      # Argoverse 2; needs pyarrow
 
-One sweep is one street: a difference in ranges is as much that of the places as that of the sensors.
+One sweep is one street: a difference in ranges may be of the places as well as of the sensors.
 """
 
 from pathlib import Path
@@ -18,7 +18,7 @@ from rich.table import Table
 from asca_pillars.cli.run_command import run_command
 from asca_pillars.sim.simulation import load_simulation_config, simulate_frame
 
-NEAREST_M = 2.5  # nearer returns are mostly the own car's
+NEAREST_M = 2.5  # nearer returns are mostly of the own car
 BANDS_M = (10, 20, 30, 50)
 UP_LIDAR_M = (1.35018, 0.0, 1.64042)  # Argoverse 2: the upper sensor in the vehicle's frame
 
@@ -42,7 +42,7 @@ def main(
 
 
 def read_sweep(path: Path) -> NDArray[np.float32]:
-    """Points (N,4) of a sweep: x, y, z about the sensor, reflectance 0..0.99 (reports of 0..100 over 100)."""
+    """Read points (N,4) of a sweep: x, y, z about the sensor, reflectance 0..0.99 (0..100 is divided by 100)."""
     if path.suffix == ".feather":
         from pyarrow import feather
 

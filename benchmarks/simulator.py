@@ -1,11 +1,11 @@
-"""How fast the simulator draws labelled frames, by stage and by number of processes.
+"""Speed of the simulator, by stage and by number of processes.
 
     OMP_NUM_THREADS=1 python -m benchmarks.simulator --frames 60 --workers 1,2
 
-Stages are those of `simulate_frame`, in milliseconds of processor time on one core, so that other programs disturb them
-little (nor does linear algebra wait on every core, see OMP_NUM_THREADS): median, and the 5th and 95th percentile over
-the frames. Frames per second are of whole frames in memory, without writing them: by the clock, and per second of one
-core's processor time, which hardly changes while others use the machine. The first frames of each process, which
+Stages are those of `simulate_frame`, in milliseconds of processor time on one core, so that other load has little
+effect (and linear algebra does not use every core, see OMP_NUM_THREADS): median, and the 5th and 95th percentile over
+the frames. Frames per second are of whole frames in memory, without writing them: by wall time, and per second of one
+core's processor time, which hardly depends on other load. The first frames of each process, which
 compile or load the ray caster, are left out.
 """
 
@@ -67,7 +67,7 @@ def main(
 
 
 def _stages(config: SimulationConfig, frames: int, seed: int) -> dict[str, list[float]]:
-    """Milliseconds of processor time of each frame, by stage."""
+    """Return the milliseconds of processor time of each frame, by stage."""
     spent: dict[str, list[float]] = defaultdict(list)
     for index in range(frames + WARM_UP):
         marks = [time.process_time()]
@@ -108,7 +108,7 @@ def _spread(rates: npt.NDArray[np.float64]) -> str:
 
 
 def _rates(config: SimulationConfig, frames: int, seed: int, workers: int) -> list[tuple[float, float]]:
-    """Frames per second of `workers` processes together, and per second of processor time, of each round."""
+    """Return the frames per second of `workers` processes together, and per second of processor time, of each round."""
     job = partial(_draw, config, seed)
     with one_thread_per_process(), multiprocessing.get_context("spawn").Pool(workers) as pool:
         pool.map(job, range(4 * WARM_UP * workers), chunksize=WARM_UP)

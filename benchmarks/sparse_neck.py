@@ -1,11 +1,11 @@
-"""A detector with a sparse neck against the same one with a dense neck: random weights, points in, boxes out, in turn.
+"""Comparison of a detector with a sparse neck and one with a dense neck: random weights, points to boxes, in turn.
 
     python -m benchmarks.sparse_neck scans/                     # the paper's width in 8 bits; default: the sample scan
     python -m benchmarks.sparse_neck scans/ --float32 --keep bundles/
 
-Once with the scans as they are and once with what the camera sees of them. Ratios of a round's medians hold on a busy
-machine too, times do not. `asca bench scans/ --bundle bundles/asca_sim_sparse_int8` says where the time of a bundle
-that was kept goes.
+Once with whole scans and once with the camera's field of view. Ratios of a round's medians hold on a busy
+machine too, times do not. `asca bench scans/ --bundle bundles/asca_sim_sparse_int8` shows the time by stage of a
+bundle that was kept.
 """
 
 import logging
@@ -50,7 +50,7 @@ def main(
 ) -> None:
     """Export both, in minutes, and print a table for each view."""
     console = Console(markup=False, highlight=False)
-    logging.getLogger("asca_pillars").setLevel(logging.ERROR)  # it may be any scan
+    logging.getLogger("asca_pillars").setLevel(logging.ERROR)  # any scan may be given
     threads = default_threads() if threads is None else threads
     loaded = [read_scan(path).points for given in scans or [sample_scan_path()] for path in find_scans(given)]
     with tempfile.TemporaryDirectory() as work, console.status("Exporting") as status:
@@ -76,7 +76,7 @@ def main(
 def export_both(
     config: str, folder: Path, *, int8: bool, progress: Callable[[str], None] = lambda _: None
 ) -> dict[Neck, Path]:
-    """Bundles of the configuration with either neck, in `folder`; those that are there already stay as they are."""
+    """Export bundles of the configuration with either neck to `folder`; existing ones are kept."""
     points, bundles = read_scan(sample_scan_path()).points, {}
     for neck in NECKS:
         bundles[neck] = folder / f"{Path(config).stem}_{neck}_{'int8' if int8 else 'float32'}"
@@ -89,7 +89,7 @@ def export_both(
 def compare_views(
     detectors: Mapping[str, Run], scans: Scans, rounds: int, bar: Track = silently
 ) -> dict[str, Comparison]:
-    """The detectors in turn on what the camera sees of scans (N, 4), metres, LiDAR frame, and on all of them."""
+    """Compare the detectors in turn on the camera's view of scans (N, 4), metres, LiDAR frame, and on whole scans."""
     views = {"camera view": [points[camera_view(points)] for points in scans], "whole scans": scans}
     return {name: compare(detectors, part, rounds, bar) for name, part in views.items()}
 

@@ -1,12 +1,12 @@
-"""What a training sample costs: in the processes that load it, and in the network; what a machine can therefore train.
+"""Cost of a training sample: in the loading processes and in the network, and the machine's training rate.
 
     asca simulate data/sim --frames 400 --view camera
     asca prepare asca_sim --data data/sim
     python -m benchmarks.training_cost asca_sim --data data/sim
 
-Samples are drawn as `asca train` draws them, augmentation and insertion included, in one process; a step is forward,
+Samples are drawn as in `asca train`, including augmentation and insertion, in one process; a step is forward,
 loss and backward on `--device`. Medians over the batches, with quartiles, in processor
-time (all threads together); of a step on another device than a CPU the time that passes.
+time (all threads together); for a step on a device other than a CPU in wall time.
 """
 
 import time

@@ -1,8 +1,8 @@
-"""Right scans made wrong on purpose: is it noticed, and does the remedy that the warning names bring the boxes back?
+"""Scans with simulated mistakes: are they detected, and does the remedy in the warning restore the boxes?
 
     python -m benchmarks.wrong_mountings data/kitti/training/velodyne
 
-Files are written as another sensor's would be and read back, as `asca detect` does it.
+Files are written as by another sensor and read back as in `asca detect`.
 """
 
 import re
@@ -35,12 +35,12 @@ Points = NDArray[np.float32]
 
 
 class Mistake(NamedTuple):
-    """One way to get a scan wrong."""
+    """Mistake in a scan."""
 
     make: Callable[[Points], Points]
-    """(N, 4) right -> (N, 4 or 5) as the wrong file holds it."""
+    """(N, 4) correct -> (N, 4 or 5) as in the wrong file."""
     mounting: Mounting
-    """That would be right for it."""
+    """Mounting that corrects it."""
 
 
 def _scaled(scale: float) -> Callable[[Points], Points]:
@@ -81,7 +81,7 @@ def main(scans: Annotated[Path, typer.Argument(help="Right scans of the sensor o
 
 
 def _try(path: Path, mistake: Mistake, right: Detections) -> tuple[int, int, int]:
-    """Whether it is noticed, and the boxes of the right scan that are found before and with the remedy."""
+    """Return whether it is detected, and the correct scan's boxes found before and with the remedy."""
     with tempfile.TemporaryDirectory() as folder:
         wrong = Path(folder) / "scan.bin"
         mistake.make(read_scan(path).points).astype("<f4").tofile(wrong)
@@ -105,7 +105,7 @@ def _detect(path: Path, settings: ScanSettings) -> tuple[list[str], Detections]:
     except AscaError as error:
         return [str(error)], Detections.empty(())
     found = Detector(mounting=scan_input.mounting)(scan.points)
-    told = [text for text in found.report.warnings if "--around" not in text]  # true of the right revolution, too
+    told = [text for text in found.report.warnings if "--around" not in text]  # true for the correct revolution, too
     return [*scan_input.said, *scan.notes.remarks, *told], found
 
 

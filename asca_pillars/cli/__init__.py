@@ -1,1 +1,1 @@
-"""What each `asca` command does, one module per command."""
+"""The `asca` commands, one module per command."""

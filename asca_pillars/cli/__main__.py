@@ -1,4 +1,4 @@
-"""`python -m asca_pillars.cli` is the command `asca`."""
+"""Entry point of `python -m asca_pillars.cli`, the command `asca`."""
 
 from asca_pillars.cli.main import main
 

@@ -1,4 +1,4 @@
-"""`asca ablate`: the paper's Table 5 on any KITTI-layout data, trained, evaluated, timed and written down."""
+"""`asca ablate`: the paper's Table 5 on any KITTI-layout data: training, evaluation, timing and report."""
 
 from pathlib import Path
 from typing import Annotated
@@ -92,7 +92,7 @@ def ablate(
     claim(out, {"config": to_dict(base), "data": str(data)} | ({} if init is None else {"init": str(init)}))
     waiting = [load_config(config, [*overrides, *one.variant.overrides]) for one in todo if not one.trained.exists()]
     if any(one.augment.insert.method != "none" for one in waiting):
-        # Once, not by every run that finds nothing there.
+        # Checked once, not by every run.
         prepare(Path(config), data=data, override=overrides, workers=default_threads())
     finish_runs(todo, config, data, base.data.val_set, jobs, overrides, init)
     console = Console(markup=False)

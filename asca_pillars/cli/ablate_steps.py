@@ -1,4 +1,4 @@
-"""The steps of `asca ablate`: one base for all runs, what the numbers depend on, and the timing."""
+"""Steps of `asca ablate`: a common base of all runs, the conditions of the numbers, and the timing."""
 
 import json
 import tempfile
@@ -37,7 +37,7 @@ TIMED_ROUNDS = 10
 
 
 def claim(out: Path, base: dict[str, Any]) -> None:
-    """Note what all runs in `out` have in common, or refuse to mix them with runs on another base.
+    """Record what all runs in `out` have in common, or refuse to mix them with runs on another base.
 
     Raises:
         OutputError: `out` holds files of something else.
@@ -45,7 +45,7 @@ def claim(out: Path, base: dict[str, Any]) -> None:
     """
     recover(out)
     is_log = starting_with(written_by(COMMAND))
-    if not any(map(is_log, out.glob("*/seed*/train.log"))):  # which says as much, where a damaged note was deleted
+    if not any(map(is_log, out.glob("*/seed*/train.log"))):  # only these logs are left where a damaged note was deleted
         require_own(out, COMMAND, {"ablation.json": json_object("config", "data")})
     require_own_file(out / RESULTS_FILE, COMMAND, ending_with(page_end(COMMAND)))
     for folder in out.glob("*/seed*"):
@@ -70,7 +70,7 @@ def claim(out: Path, base: dict[str, Any]) -> None:
 
 
 def setup(todo: Sequence[Run], config: str, data: Path, lists: DataConfig, jobs: int) -> str:
-    """What the numbers depend on: command, data, machine, time, versions."""
+    """Return the conditions of the numbers: command, data, machine, time, versions."""
     trained = [json.loads(one.trained.read_text(encoding="utf-8")) for one in todo]
     hours = sum(record["seconds"] for record in trained) / 3600
     trained_on, checked_on = (len(KittiSplit(data, name).frame_ids) for name in (lists.train_set, lists.val_set))
@@ -88,10 +88,10 @@ def setup(todo: Sequence[Run], config: str, data: Path, lists: DataConfig, jobs:
 
 
 def parse_seeds(text: str) -> list[int]:
-    """Whole numbers with commas between them.
+    """Parse comma-separated integers.
 
     Raises:
-        ConfigError: it is something else.
+        ConfigError: the text is something else.
     """
     parts = [part.strip() for part in text.split(",")]
     seeds = [int(part) for part in parts if part.isdecimal()]
@@ -101,7 +101,7 @@ def parse_seeds(text: str) -> list[int]:
 
 
 def family_of(config: Config) -> Family:
-    """The variants that fit a base.
+    """Return the variants of a base.
 
     Raises:
         ConfigError: there are none for its kind.
@@ -113,10 +113,10 @@ def family_of(config: Config) -> Family:
 
 
 def parse_variants(text: str, family: Family) -> list[Row]:
-    """Names with commas between them, or `all`.
+    """Parse comma-separated names, or `all`.
 
     Raises:
-        ConfigError: there is no such variant, or one is there twice.
+        ConfigError: there is no such variant, or one is named twice.
     """
     variants = family.variants
     names = list(variants) if text == "all" else text.split(",")
@@ -129,7 +129,7 @@ def parse_variants(text: str, family: Family) -> list[Row]:
 
 
 def check(variants: Sequence[Row], config: str, overrides: Sequence[str], data: Path, init: Path | None = None) -> None:
-    """Find before hours of training what would end them.
+    """Check before hours of training for errors that would end them.
 
     Raises:
         ConfigError: a row does not go with the base.
@@ -174,7 +174,7 @@ def time_variants(todo: Sequence[Run], family: Family, split: KittiSplit, consol
     from asca_pillars.models.checkpoint import load_checkpoint
 
     scans = [read_frame(split, frame_id, ()).points for frame_id in split.frame_ids[:MIN_SCANS]]
-    first = {one.variant.name: one for one in reversed(todo)}  # of several seeds the first one wins
+    first = {one.variant.name: one for one in reversed(todo)}  # with several seeds the first one is timed
     detectors: dict[str, Detector] = {}
     parameters: dict[str, int] = {}
     with tempfile.TemporaryDirectory() as folder:

@@ -1,4 +1,4 @@
-"""`asca bench`: where the milliseconds go, and on what machine."""
+"""`asca bench`: time of every stage, with the machine's properties."""
 
 from pathlib import Path
 from typing import Annotated
@@ -22,7 +22,7 @@ from asca_pillars.cli.options import (
     scan_settings,
 )
 
-MOST_SCANS = 100  # they are held in memory, and every round goes over all of them
+MOST_SCANS = 100  # held in memory, and run in every round
 
 
 def bench(
@@ -142,10 +142,10 @@ def bench(
     from asca_pillars.scans.recordings.recorded_scans import RecordedScans
     from asca_pillars.scans.scan_input import ScanInput
 
-    # A pipe has no width, and the tables are wider than the 80 columns that rich takes then.
+    # A pipe has no width, and the tables are wider than rich's default of 80 columns.
     piped = not sys.stdout.isatty() and "COLUMNS" not in os.environ
     console = Console(markup=False, highlight=False, width=120 if piped else None)
-    logging.getLogger("asca_pillars").setLevel(logging.ERROR)  # `asca detect` warns of odd scans; here they are timed
+    logging.getLogger("asca_pillars").setLevel(logging.ERROR)  # no warnings of unusual scans, as in `asca detect`
     if around and (matrix or cold):
         raise ConfigError("--matrix and --cold time single passes: leave --around out, or them")
     settings = scan_settings(
@@ -178,7 +178,7 @@ def bench(
         raise ScanError("the first scan has no points to take fewer or more of; give another for --scaling")
     bundles = named_bundles([bundle, *(compare or ())])
     for folder in bundles.values():
-        load_bundle(folder)  # a damaged one is named now and not after minutes
+        load_bundle(folder)  # a damaged one is reported now and not after minutes
     report_json = "asca bench", json_object("fps", "stages_ms", "runs_on", "graphs_sha256")
     require_writable(json, *report_json)
     options = RuntimeOptions(bundle=bundle, provider=provider, precision=precision, threads=threads)

@@ -1,4 +1,4 @@
-"""The parts of a benchmark, measured one after the other and printed as soon as each is there."""
+"""Parts of a benchmark, each measured and printed in turn."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
@@ -29,7 +29,7 @@ from asca_pillars.cli import bench_tables as show
 
 @dataclass(frozen=True)
 class Parts:
-    """What to measure besides the stages."""
+    """Parts to measure in addition to the stages."""
 
     compare: bool = False
     matrix: bool = False
@@ -61,7 +61,7 @@ def measure_parts(
     if not all(report.points_inside):
         lines.append("no roofline: the backbone has nothing to compute in a scan without points in the model's ranges")
     elif detector.provider in ON_THE_CPU:
-        # All passes of a scan are in the stage, and the backbone's operations are those of one.
+        # The stage includes all passes of a scan, the backbone's operations are those of one pass.
         pass_ms = report.stages_ms["neck+head"].p50 / detector.passes
         roofline = measure_roofline(detector.bundle, pass_ms, detector.threads)
         result["roofline"] = asdict(roofline)
@@ -98,12 +98,12 @@ def measure_parts(
 
 
 def _has_sparse_backbone(bundle: Bundle) -> bool:
-    """Whether what it multiplies differs from scan to scan."""
+    """Return whether the backbone's operations differ between scans."""
     return not isinstance(bundle, PillarBundle) or bundle.pillar.neck == "sparse"
 
 
 def _like(detector: Detector, folder: Path) -> Detector:
-    """Another bundle, run the same way."""
+    """Open another bundle with the same settings."""
     return Detector(
         folder,
         provider=detector.provider,
@@ -115,7 +115,7 @@ def _like(detector: Detector, folder: Path) -> Detector:
 
 
 def named_bundles(bundles: Sequence[Path | None]) -> dict[str, Path]:
-    """Folders by the names that tables show them by."""
+    """Return folders by their names in tables."""
     folders: list[Path] = []
     for bundle in bundles:
         folder = find_bundle(bundle)
@@ -123,6 +123,6 @@ def named_bundles(bundles: Sequence[Path | None]) -> dict[str, Path]:
             raise ConfigError(f"--compare {bundle}: a bundle is compared with itself or given twice; name another one")
         folders.append(folder)
     named = {folder.name: folder for folder in folders}
-    if len(named) < len(folders):  # two folders of one name are told apart by their whole path
+    if len(named) < len(folders):  # folders of equal names are named by their whole paths
         named = {str(folder): folder for folder in folders}
     return named

@@ -1,4 +1,4 @@
-"""What `asca bench` prints: a table or a line for each part of a benchmark."""
+"""Output of `asca bench`: a table or a line for each part of a benchmark."""
 
 from collections.abc import Mapping, Sequence
 
@@ -21,7 +21,7 @@ _BOXES = "boxes: largest difference from the first row's (boxes without a partne
 
 
 def stages_table(report: BenchmarkReport) -> Table:
-    """Percentiles of every stage."""
+    """Return a table with percentiles of every stage."""
     points = f"{min(report.points)}" if len(set(report.points)) == 1 else f"{min(report.points)}-{max(report.points)}"
     title = f"{report.bundle}: {report.frames} warm frames, {report.scans} scan(s) of {points} points"
     if report.passes > 1:
@@ -33,7 +33,7 @@ def stages_table(report: BenchmarkReport) -> Table:
 
 
 def summary_lines(report: BenchmarkReport) -> list[str]:
-    """Late frames, FPS, the share outside the graphs, start and memory."""
+    """Return late frames, FPS, the fraction of time outside the graphs, start and memory."""
     memory = "" if report.peak_memory_mib is None else f", peak memory {report.peak_memory_mib:.0f} MiB"
     late = []
     if report.deadline_ms is not None and report.late_share is not None:
@@ -47,13 +47,13 @@ def summary_lines(report: BenchmarkReport) -> list[str]:
 
 
 def machine_line(report: BenchmarkReport) -> str:
-    """What the figures belong to."""
+    """Return the machine, threads and versions of the measurements."""
     versions = ", ".join(f"{name} {version}" for name, version in report.versions.items())
     return f"{report.cpu}, {report.threads} threads, {report.runs_on}; {versions}"
 
 
 def roofline_line(found: Roofline, *, sparse: bool) -> str:
-    """Achieved beside possible; of a sparse neck both are by the mean of the scans that it was exported with."""
+    """Return achieved and possible rates; for a sparse neck both are means over the scans of its export."""
     rates = ", ".join(f"{kind} {rate:.0f}" for kind, rate in found.gemm_gmac_s.items())
     return (
         f"roofline: backbone {found.gmac:.1f} GMAC at {found.achieved_gmac_s:.0f} GMAC/s, {found.share:.0%} of this "
@@ -63,7 +63,7 @@ def roofline_line(found: Roofline, *, sparse: bool) -> str:
 
 
 def comparison_table(found: Comparison, boxes: Mapping[str, BoxDifference] | None = None) -> Table:
-    """Contestants, how many times as fast as the first they are, and, if known, how far their boxes are from its."""
+    """Return a table of bundles with their speed relative to the first and, if known, the difference of their boxes."""
     title = "; ".join([f"{found.rounds} rounds in turn", *([_BOXES] if boxes else [])])
     table = _table(title, "", "p50 ms", "p95 ms", "FPS", "times as fast", *(["boxes"] if boxes else []))
     for one in found.contestants:
@@ -72,7 +72,7 @@ def comparison_table(found: Comparison, boxes: Mapping[str, BoxDifference] | Non
 
 
 def matrix_table(rows: Sequence[MatrixRow]) -> Table:
-    """Every way that runs; see `matrix_reasons` for the others."""
+    """Return a table of all configurations that run; see `matrix_reasons` for the others."""
     title = f"Ways to run, in turn; {_BOXES}"
     columns = ("provider", "precision", "threads", "p50 ms", "FPS", "times as fast", "boxes")
     table = _table(title, "bundle", *columns, names=3)
@@ -84,14 +84,14 @@ def matrix_table(rows: Sequence[MatrixRow]) -> Table:
 
 
 def matrix_reasons(rows: Sequence[MatrixRow]) -> list[str]:
-    """Why ways do not run, each reason once: it is the same for every bundle."""
+    """Return the reasons why configurations do not run, each once: they are the same for every bundle."""
     return list(
         dict.fromkeys(f"not {row.way.provider} {row.way.precision}: {row.reason}" for row in rows if row.reason)
     )
 
 
 def scaling_table(rows: Sequence[ScalingRow]) -> Table:
-    """Stages by number of points."""
+    """Return a table of stages by number of points."""
     table = _table("p50 ms by number of points", "points", "pillars", *rows[0].stages_ms, "total", names=0)
     for row in rows:
         times = [f"{value:.2f}" for value in (*row.stages_ms.values(), row.total_ms)]
@@ -100,7 +100,7 @@ def scaling_table(rows: Sequence[ScalingRow]) -> Table:
 
 
 def stream_table(found: Throughput) -> Table:
-    """One by one and streamed."""
+    """Return a table of single calls and streaming."""
     title = f"Stream: {_spread(found.gain)} times the scans per second, {found.rounds} rounds in turn"
     table = _table(title, "", "scans per second", "latency p50 ms", "p95 ms")
     for name, fps, latency in (
@@ -112,7 +112,7 @@ def stream_table(found: Throughput) -> Table:
 
 
 def cold_line(found: ColdStart) -> str:
-    """A new process."""
+    """Return the times and the memory of a new process."""
     memory = found.detect_peak_memory_mib
     return (
         f"new process: {found.first_boxes_s:.2f} s to the first boxes (import {found.import_s:.2f}, load "
@@ -122,7 +122,7 @@ def cold_line(found: ColdStart) -> str:
 
 
 def _table(title: str, *columns: str, names: int = 1) -> Table:
-    """A table whose first columns are words and the others numbers."""
+    """Return a table whose first columns are text and the others numbers."""
     table = Table(title=title)
     for index, column in enumerate(columns):
         table.add_column(column, justify="left" if index < names else "right")

@@ -1,4 +1,4 @@
-"""`asca bundle`: which models there are, what one holds, and whether it is whole."""
+"""`asca bundle`: list, description and verification of bundles."""
 
 from pathlib import Path
 from typing import Annotated

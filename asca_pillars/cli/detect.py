@@ -1,4 +1,4 @@
-"""`asca detect`: scans or a recording in, tables, pictures, KITTI text and tracks out."""
+"""`asca detect`: boxes of scans or a recording as tables, pictures, KITTI text and tracks."""
 
 import sys
 from collections.abc import Sequence
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from asca_deploy.recordings.detect_recording import RecordingResult
     from asca_pillars.pictures.video import VideoView
 
-TIMED_FRAMES = 6  # at least so many are run, the first is left out: one frame alone times the warm-up
+TIMED_FRAMES = 6  # least number of frames; the first one, the warm-up, is left out
 
 
 def detect(
@@ -300,7 +300,7 @@ def detect(
 
 
 def _refuse_times(rate: float | None, times: Path | None) -> None:
-    """Times of scans go with folders alone."""
+    """Refuse options for the times of scans with inputs other than folders."""
     if rate is not None or times is not None:
         option = f"--rate {rate:g}" if rate is not None else f"--times {times}"
         raise ConfigError(f"{option}: is for folders of scans, and a recording has its times; leave it out")

@@ -1,4 +1,4 @@
-"""Tables of `asca detect`: one scan's boxes or a line per scan, and the time of every stage."""
+"""Tables of `asca detect`: one scan's boxes or a row per scan, and the time of every stage."""
 
 import statistics
 from collections.abc import Sequence
@@ -20,7 +20,7 @@ def remark(console: Console, text: str) -> None:
 
 
 def boxes(path: Path, detections: ScanDetections) -> Table:
-    """The boxes of one scan, the nearest first."""
+    """Return a table of the boxes of one scan, nearest first."""
     table = Table(title=f"{path.name}: {len(detections)} objects")
     for column in ("class", "score", "distance", "direction", "size l x w x h", "heading"):
         table.add_column(column, justify="left" if column == "class" else "right")
@@ -39,13 +39,13 @@ def boxes(path: Path, detections: ScanDetections) -> Table:
 
 
 def _direction(bearing_deg: float) -> str:
-    """Such as "12° left" or "170° right", from straight ahead."""
+    """Return a direction relative to straight ahead, such as "12° left" or "170° right"."""
     angle = round(abs(bearing_deg))
     return "ahead" if angle == 0 else f"{angle}° {'left' if bearing_deg > 0 else 'right'}"
 
 
 def scans(results: DetectedScans, spec: DetectorSpec) -> Table:
-    """A line per scan: how many objects of each class."""
+    """Return a table with the number of objects of each class, a row per scan."""
     table = Table(title=f"{len(results)} scans")
     for column in ("scan", "points", *spec.class_names, "time"):
         table.add_column(column, justify="left" if column == "scan" else "right")
@@ -59,7 +59,7 @@ def scans(results: DetectedScans, spec: DetectorSpec) -> Table:
 
 
 def timing(reports: Sequence[FrameReport], detector: Detector) -> str:
-    """Median times of warm frames, stage by stage."""
+    """Return the median times of frames after the warm-up, by stage."""
     medians = {stage: statistics.median(one.times_ms[stage] for one in reports) for stage in reports[0].times_ms}
     total_ms = statistics.median(report.total_ms for report in reports)
     stages = " + ".join(f"{stage} {value:.1f}" for stage, value in medians.items())

@@ -1,4 +1,4 @@
-"""`asca doctor`: what runs here, and what to install for the rest."""
+"""`asca doctor`: capabilities of this machine, and how to install missing parts."""
 
 from typing import Annotated
 

@@ -1,4 +1,4 @@
-"""What runs on this machine: the checks of `asca doctor`."""
+"""Checks of `asca doctor`."""
 
 import platform
 from collections.abc import Callable
@@ -18,7 +18,7 @@ from asca_pillars.base.system import cpu_model, own_version, package_versions
 
 
 def check_machine() -> dict[str, Any]:
-    """Versions and, for each provider, extra and the bundled model, whether it runs ("ok") and why or how ("says")."""
+    """Return versions and, for each provider, extra and the bundled model, if it runs ("ok") and details ("says")."""
     return {
         "version": own_version(),
         "python": platform.python_version(),

@@ -1,4 +1,4 @@
-"""`asca eval`: a model or finished predictions against labels, by one of five protocols."""
+"""`asca eval`: evaluation of a model or of predictions against labels, by one of five protocols."""
 
 from pathlib import Path
 from typing import Annotated, Literal

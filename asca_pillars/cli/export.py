@@ -1,4 +1,4 @@
-"""`asca export`: a checkpoint in, a bundle out that was compared with it; or from a bundle what other runtimes need."""
+"""`asca export`: export of a checkpoint to a verified bundle, or of a bundle to files for other runtimes."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -173,7 +173,7 @@ def export(
 
 
 def _print_quantization(report: "Quantization", console: "Console") -> None:
-    """A line per layer, and what the boxes say."""
+    """Print a row per layer, and the effect on the boxes."""
     from rich.table import Table
 
     table = Table(title=f"In 8 bits, calibrated on {report.calibration_scans} scans")
@@ -202,14 +202,14 @@ def _export_for_runtime(
     browser: bool,
     ort_web: Path | None,
 ) -> None:
-    """`asca export --golden` and `asca export --browser`.
+    """Run `asca export --golden` or `asca export --browser`.
 
     Args:
         bundle: folder, or name of one that ships.
-        out: folder to be written.
-        scans: the scan, or a folder of which the first is taken; None for the one that comes with the package.
-        of_a_checkpoint: options, by name, that a bundle has no use for.
-        golden, browser: which of the two; one of them.
+        out: output folder.
+        scans: the scan, or a folder whose first scan is used; None for the package's sample.
+        of_a_checkpoint: options, by name, that do not apply to a bundle.
+        golden, browser: exactly one of them is set.
         ort_web: npm's package onnxruntime-web, for `browser`.
 
     Raises:

@@ -1,4 +1,4 @@
-"""`asca import`: labels of other datasets as a dataset with boxes in the LiDAR frame; scans stay where they are."""
+"""`asca import`: import of other datasets as a dataset with boxes in the LiDAR frame; scans are not copied."""
 
 from pathlib import Path
 from typing import Annotated

@@ -1,4 +1,4 @@
-"""`asca import-weights`: a detector of OpenPCDet or mmdetection3d as a checkpoint that `asca` exports and evaluates."""
+"""`asca import-weights`: conversion of an OpenPCDet or mmdetection3d checkpoint to one that `asca` exports."""
 
 from pathlib import Path
 from typing import Annotated

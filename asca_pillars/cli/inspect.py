@@ -1,4 +1,4 @@
-"""`asca inspect`: a dataset before hours of training, or scans without labels before they are detected."""
+"""`asca inspect`: inspection of a dataset before training, or of scans without labels before detection."""
 
 from pathlib import Path
 from typing import Annotated, Any
@@ -246,7 +246,7 @@ def _inspect_dataset(
         console.print("\n".join(draw_frames(data, frames_of.name, settings, draw, pictures)), soft_wrap=True)
     errors = [finding for finding in found if finding.level == "error"]
     for finding in found:
-        if finding not in errors[:1]:  # the first one is what the command fails with, below all of them
+        if finding not in errors[:1]:  # the first one is the command's error, below all of them
             style = "red" if finding.level == "error" else "yellow"
             console.print(f"{finding.level}: {finding.text}", style=style, soft_wrap=True)
     if errors:

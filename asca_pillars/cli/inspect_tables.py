@@ -1,4 +1,4 @@
-"""What `asca inspect` prints: a table for each thing that can go wrong before training."""
+"""Tables of `asca inspect`, one for each kind of problem before training."""
 
 from collections.abc import Sequence
 
@@ -12,7 +12,7 @@ from asca_pillars.data.inspection.measurements import InputCells
 
 
 def types(inspection: Inspection, names: Sequence[str]) -> Table:
-    """Labelled types, how often, and what training makes of each."""
+    """Return a table of labelled types, their number, and their use in training."""
     neighbors = {NEIGHBOR_TYPES[name]: name for name in names if name in NEIGHBOR_TYPES}
     table = _table("Labels", "type", "count", "per frame", "in training")
     for kind, count in inspection.types.items():
@@ -22,7 +22,7 @@ def types(inspection: Inspection, names: Sequence[str]) -> Table:
 
 
 def objects(inspection: Inspection, min_points: int) -> Table:
-    """Boxes and points per class, and what lies outside."""
+    """Return a table of boxes and points per class, and of those outside the ranges."""
     few = f"< {min_points}"
     title = (
         "Objects: points inside a box (10 % / median / 90 %); boxes with 0 or few, out of the grid, cut by z_range_m"
@@ -37,7 +37,7 @@ def objects(inspection: Inspection, min_points: int) -> Table:
 
 
 def conventions(inspection: Inspection) -> Table:
-    """Points in the boxes by each convention for yaw and z."""
+    """Return a table of the points in the boxes by each convention for yaw and z."""
     title = "Conventions: points in the boxes of the classes as labelled and otherwise; boxes with 10 % more or fewer"
     table = _table(title, "boxes", "points", "more", "fewer")
     for fit in inspection.conventions:
@@ -46,7 +46,7 @@ def conventions(inspection: Inspection) -> Table:
 
 
 def sizes(inspection: Inspection) -> Table:
-    """Sizes per class against the anchors."""
+    """Return a table of sizes per class compared with the anchors."""
     title = "Sizes, m: mean ± standard deviation (difference to the anchor); misfits cannot reach positive_iou"
     table = _table(title, "class", "length", "width", "height", "center z", "misfits")
     for facts in inspection.classes:
@@ -63,7 +63,7 @@ def _size_cells(facts: ClassFacts) -> list[str]:
 
 
 def matching(inspection: Inspection) -> Table:
-    """How many anchors each class will learn from."""
+    """Return a table of the number of positive anchors of each class."""
     title = "Matching: objects to find, by the best anchor that is to find them: positive_iou, only the nearest, none"
     table = _table(title, "class", "objects", "by IoU", "nearest", "none", "anchors per frame", "per object")
     for facts in inspection.classes:
@@ -75,7 +75,7 @@ def matching(inspection: Inspection) -> Table:
 
 
 def scans(inspection: Inspection, kind: InputCells, camera_view: bool) -> Table:
-    """Points, reflectance, ground, pillars or voxels of the scans."""
+    """Return a table of points, reflectance, ground, pillars or voxels of the scans."""
     scans = inspection.scans
     low, high = scans.reflectance_stored
     ground = "not seen" if scans.ground_z_m is None else _spread(scans.ground_z_m, 2)
@@ -101,7 +101,7 @@ def scans(inspection: Inspection, kind: InputCells, camera_view: bool) -> Table:
 
 
 def recorded(found: ScansInspection) -> list[Table | str]:
-    """What was inspected; of a recording its topics, if there are several, and its times, frames and fields."""
+    """Return what was inspected; for a recording its topics, if there are several, and its times, frames and fields."""
     of_topic = "" if found.topic is None else f", {printable(found.topic)}"
     looks_in = ", ".join(f"{axis} {low:g} to {high:g}" for axis, (low, high) in zip("xyz", found.ranges, strict=True))
     lines: list[Table | str] = [
@@ -126,7 +126,7 @@ def recorded(found: ScansInspection) -> list[Table | str]:
 
 
 def unlabelled(found: ScansInspection) -> Table:
-    """Points, reflectance, ground and ranges of scans without labels, against those of a model's training."""
+    """Return a table of points, reflectance, ground and ranges of unlabelled scans, beside the training scans'."""
     expected, height = found.expected, found.height
     low, high = expected.points_per_scan
     view = " (a camera's view)" if expected.camera_view else ""

@@ -1,4 +1,4 @@
-"""The command `asca`: registers what `cli` holds. Each command imports what it needs when it runs."""
+"""Registration of the commands of `asca`. Each command imports its dependencies when it runs."""
 
 import inspect as inspect_module
 from collections.abc import Callable
@@ -56,7 +56,7 @@ _add(doctor)
 
 
 def main() -> None:
-    """Run the command; what the user can mend is one line on stderr and the exit code of its kind."""
+    """Run the command; a user's error is one line on stderr and an exit code by its kind."""
     run_command(app, "asca")
 
 

@@ -1,4 +1,4 @@
-"""Options that several commands share, declared once. Nothing heavy is imported here: `asca --help` is instant."""
+"""Options shared by several commands. Slow imports are avoided here, so that `asca --help` is fast."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -182,10 +182,10 @@ ClusterOption = Annotated[
 
 
 def read_scores(texts: Sequence[str] | None) -> float | dict[str, float] | None:
-    """`--score` as typed; None if it was not given.
+    """Parse `--score`; return None if it was not given.
 
     Raises:
-        ConfigError: one is no score, or a score for every class stands beside others.
+        ConfigError: one is not a score, or a score for every class is given with others.
     """
     scores: dict[str, float] = {}
     for text in texts or ():
@@ -206,10 +206,10 @@ def read_scores(texts: Sequence[str] | None) -> float | dict[str, float] | None:
 def scan_settings(
     *, sensor_height: str | None, axes: str, pose: Path | None, reflectance_scale: str, columns: int | None
 ) -> "ScanSettings":
-    """The options of that name, as typed.
+    """Return the scan settings of the options.
 
     Raises:
-        ConfigError: one cannot be used.
+        ConfigError: one is invalid.
     """
     from asca_pillars.scans.scan_settings import ScanSettings
 

@@ -1,4 +1,4 @@
-"""`asca prepare`: what insertion needs of a dataset, computed before training instead of during its first epoch."""
+"""`asca prepare`: computation of the caches for insertion before training instead of during its first epoch."""
 
 from typing import Annotated
 
@@ -56,7 +56,7 @@ def prepare(
         for name in (settings.data.train_set, settings.data.val_set):
             build_preparation(settings.model, open_split(data, name), replace(settings.data, workers=workers))
         return
-    # A config that is not decided yet gets what either method needs.
+    # A config without a chosen method gets the caches of both.
     insert = settings.augment.insert
     insert = insert if insert.method != "none" else replace(insert, method="rs_aug")
     spec = settings.model.spec

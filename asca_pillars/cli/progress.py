@@ -10,10 +10,10 @@ from asca_pillars.base.errors import printable
 
 
 class Bars:
-    """A bar for each step that a function reports; as its `progress`, in a `with` block.
+    """Progress bars for the steps reported by a function; pass it as `progress`, in a `with` block.
 
     Args:
-        console: to draw on.
+        console: console to draw on.
         transient: remove a bar when its step is done.
     """
 
@@ -32,7 +32,7 @@ class Bars:
         self._stop()
 
     def __call__(self, step: str, done: int, total: int) -> None:
-        """`done` of `total` parts of a step are done."""
+        """Update the bar of a step: `done` of `total` parts are done."""
         if self._bar is None or step != self._step:
             self._stop()
             self._bar, self._step = Progress(console=self._console, transient=self._transient), step
@@ -43,7 +43,7 @@ class Bars:
             self._stop()
 
     def step(self, text: str) -> None:
-        """Show what is being done, where nobody knows how long it takes."""
+        """Show a step of unknown duration."""
         if self._status is None:
             self._stop()
             self._status = self._console.status(text)

@@ -1,4 +1,4 @@
-"""`asca ros2`: a live topic of point clouds in, boxes out."""
+"""`asca ros2`: boxes for a live topic of point clouds."""
 
 from typing import Annotated, cast
 
@@ -102,4 +102,4 @@ def ros2(
         return open_detector(options, least, mounting, around=around)
 
     run_node(settings, opened, Tracker(birth_score=births) if track else None)
-    os._exit(0)  # all is closed; on a busy machine the libraries would take seconds to unload
+    os._exit(0)  # everything is closed; on a busy machine the libraries would take seconds to unload

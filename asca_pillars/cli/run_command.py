@@ -1,4 +1,4 @@
-"""The end of a command: an error that the user can fix is one line on stderr and the exit code of its kind."""
+"""Error handling of commands: a user's error is one line on stderr and an exit code by its kind."""
 
 import io
 import sys
@@ -15,12 +15,12 @@ def run_command(command: Callable[..., object], name: str | None = None) -> None
     """Run a Typer application, or a function whose parameters Typer reads from the command line.
 
     Args:
-        command: what to run.
-        name: what a message begins with; None is the name of the script that runs.
+        command: the command.
+        name: start of error messages; None is the name of the running script.
     """
     name = name or Path(sys.argv[0]).stem
     if isinstance(sys.stdout, io.TextIOWrapper):
-        sys.stdout.reconfigure(errors="replace")  # an ASCII terminal gets `?` for `°`, not a traceback
+        sys.stdout.reconfigure(errors="replace")  # an ASCII terminal shows `?` for `°` instead of a traceback
     try:
         command() if isinstance(command, typer.Typer) else typer.run(command)
     except AscaError as error:

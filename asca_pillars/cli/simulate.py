@@ -1,4 +1,4 @@
-"""`asca simulate`: a folder of labelled street scans or of short drives, and how like real ones the scans are."""
+"""`asca simulate`: a folder of labelled simulated scans or short drives, and reports of their realism."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -159,7 +159,7 @@ def simulate(
     if bundle is not None:
         from asca_deploy.open_model import RuntimeOptions, open_model
 
-        open_model(RuntimeOptions(bundle=bundle), 0.0)  # and so is a wrong bundle
+        open_model(RuntimeOptions(bundle=bundle), 0.0)  # likewise a wrong bundle
     console = Console(markup=False)
     there = any((out / "training" / "velodyne").glob("*.bin"))
     if sequences is not None or frames is not None or not (there and (report or like is not None)):
@@ -219,7 +219,7 @@ def _report_like_for_like(out: Path, like: Path, bundle: Path | None, console: "
 
 
 def _claimed(out: Path) -> Path:
-    """The folder of the reports, in which nothing but earlier ones is replaced; OutputError names anything else."""
+    """Return the folder of the reports, which may contain earlier ones only; else OutputError names the first other."""
     from asca_pillars.base.own_files import ending_with, is_own_picture, json_object, require_no_link, require_own
     from asca_pillars.sim.report.tables import PAGE_END
 

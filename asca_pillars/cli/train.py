@@ -1,4 +1,4 @@
-"""`asca train`: a YAML and a dataset in, a run's folder out."""
+"""`asca train`: training by a YAML on a dataset, into a run's folder."""
 
 from pathlib import Path
 from typing import Annotated
@@ -8,7 +8,7 @@ import typer
 from asca_pillars.base.extras import require
 from asca_pillars.cli.options import ConfigArgument, DataOption, InitOption, OverridesOption
 
-INTERRUPTED = 130  # what a shell says of a command that Ctrl-C ended
+INTERRUPTED = 130  # exit code of a command ended by Ctrl-C
 
 
 def train(

@@ -82,7 +82,7 @@ def view(
             print(line)
         count = len(server.names)
         print(f"{count} scan{'s' if count != 1 else ''}: {server.address} (Ctrl-C ends)", flush=True)
-        if not no_browser:  # in a thread: a browser of the terminal returns when it is left
+        if not no_browser:  # in a thread: a terminal browser returns only when it is closed
             threading.Thread(target=webbrowser.open, args=(server.address,), daemon=True).start()
         try:
             server.serve()

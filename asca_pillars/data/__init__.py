@@ -1,1 +1,1 @@
-"""Labelled frames, their augmentation, and the files they come from."""
+"""Labelled frames, their augmentation, and the readers and writers of their files."""

@@ -1,4 +1,4 @@
-"""Random changes of a labelled frame and random corruption of its points, drawn from the generator passed in."""
+"""Random augmentation of a labelled frame and corruption of its points, with the given random generator."""
 
 from dataclasses import replace
 
@@ -11,8 +11,8 @@ from asca_pillars.geometry.boxes import points_in_boxes, wrap_angle
 from asca_pillars.geometry.overlap import bev_intersection
 from asca_pillars.geometry.rotations import transform_points
 
-FEWEST_POINTS = 5  # that a cut object keeps; with fewer it could not be detected
-WIDEST_CUT = 0.5  # share of an object's extent in azimuth or elevation
+FEWEST_POINTS = 5  # kept of a cut object; with fewer it could not be detected
+WIDEST_CUT = 0.5  # fraction of an object's extent in azimuth or elevation
 
 
 def corrupt_objects(
@@ -22,14 +22,14 @@ def corrupt_objects(
     rng: np.random.Generator,
     sensor_m: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> NDArray[np.float32]:
-    """Brighten, shake and cut the points inside each box.
+    """Scale the reflectance of the points inside each box, add noise to them and cut some out.
 
     Args:
-        points: (N, 4) x, y, z in metres (LiDAR frame), reflectance 0..1; they stay as they are.
+        points: (N, 4) x, y, z in metres (LiDAR frame), reflectance 0..1; not changed.
         boxes: (M, 7) labelled boxes, LiDAR frame.
-        config: the changes and their strength.
-        rng: generator of the changes.
-        sensor_m: position of the sensor in the points' frame, from which cuts are seen.
+        config: the augmentations and their strength.
+        rng: random generator.
+        sensor_m: position of the sensor in the points' frame, from which azimuth and elevation of cuts are measured.
 
     Returns:
         (K, 4), K <= N, without the points that were cut out.
@@ -43,7 +43,7 @@ def corrupt_objects(
     for inside in points_in_boxes(points, boxes).T:
         indices = np.flatnonzero(inside)
         if brighten:
-            gain = np.exp(rng.uniform(np.log(low), np.log(high)))  # twice as bright is as likely as half
+            gain = np.exp(rng.uniform(np.log(low), np.log(high)))  # doubling is as likely as halving
             points[indices, 3] = np.minimum(points[indices, 3] * gain, 1)
         if shake:
             points[indices, :3] += rng.normal(0, config.object_jitter_m, (len(indices), 3))
@@ -69,14 +69,14 @@ def lose_reflectance(points: NDArray[np.float32], config: AugmentConfig, rng: np
 
 
 def _cut(xyz: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.bool_]:
-    """Mask of an object's points (N, 3) in a random sector, or in a random group of rings, seen from the origin.
+    """Return the mask of an object's points (N, 3) in a random azimuth sector, or in a random group of rings.
 
     Something thin in front takes away a sector of azimuth, a hedge or a beam that fails a range of elevation.
     """
     if not len(xyz):
         return np.zeros(0, dtype=bool)
     if rng.random() < 0.5:
-        center = xyz.mean(axis=0)  # angles against the object's own direction do not wrap
+        center = xyz.mean(axis=0)  # angles relative to the object's own direction do not wrap
         along = xyz[:, 0] * center[0] + xyz[:, 1] * center[1]
         across = xyz[:, 1] * center[0] - xyz[:, 0] * center[1]
         angle = np.arctan2(across, along)
@@ -88,7 +88,7 @@ def _cut(xyz: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.bool_
     return (angle >= start) & (angle <= start + width)
 
 
-OBJECT_TRIES = 10  # draws of an object's new pose before it keeps the old one
+OBJECT_TRIES = 10  # sampled poses of an object before it keeps its old one
 
 
 def augment(
@@ -97,12 +97,12 @@ def augment(
     rng: np.random.Generator,
     sensor_m: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> LabeledFrame:
-    """Per-object noise, corruption, flip, rotation, scaling, height shift and point dropout, in this order.
+    """Apply object noise, corruption, flip, rotation, scaling, height shift and point dropout, in this order.
 
     Args:
         frame: not changed.
-        config: the changes and their strength.
-        rng: generator of the changes.
+        config: the augmentations and their strength.
+        rng: random generator.
         sensor_m: position of the sensor in the frame of the points.
     """
     frame = replace(frame, points=frame.points.copy(), boxes=frame.boxes.copy())
@@ -164,7 +164,7 @@ def move_objects(frame: LabeledFrame, config: AugmentConfig, rng: np.random.Gene
             moved[:3] += shift_m
             moved[6] = wrap_angle(moved[6] + turn_rad)
             if not bev_intersection(moved[None], others).any():
-                # Looked up only now: where labelled boxes overlap, a point goes with the first that takes it.
+                # Looked up only now: where labelled boxes overlap, a point belongs to the first one that selects it.
                 inside = points_in_boxes(frame.points, frame.boxes[index : index + 1])[:, 0]
                 local = frame.points[inside, :3] - frame.boxes[index, :3]
                 transform_points(local[:, :2], _rotation(turn_rad), out=local[:, :2])

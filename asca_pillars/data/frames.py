@@ -12,12 +12,12 @@ from asca_pillars.detection.anchors import IGNORED
 from asca_pillars.geometry.boxes import points_in_boxes
 from asca_pillars.geometry.ranges import Ranges
 
-# Types that KITTI's protocol counts neither as true nor as false for a class.
+# Types that KITTI's evaluation counts neither as true nor as false positives of a class.
 NEIGHBOR_TYPES = {"Car": "Van", "Pedestrian": "Person_sitting"}
 
 
 def other_spelling(name: str, types: Iterable[str]) -> str | None:
-    """The one of `types` that differs from `name` in case, blanks or punctuation alone; None if there is none."""
+    """Return the one of `types` that differs from `name` in case, blanks or punctuation alone, or None."""
     return next((kind for kind in types if kind != name and _letters(kind) == _letters(name)), None)
 
 
@@ -26,7 +26,7 @@ def _letters(name: str) -> str:
 
 
 class Motion(NamedTuple):
-    """Global augmentation of a scene, in this order: mirrored about the x axis, turned, scaled, raised."""
+    """Global augmentation of a scene, in this order: flip about the x axis, rotation, scaling, height shift."""
 
     flipped: bool = False
     rotation_rad: float = 0.0
@@ -39,7 +39,7 @@ UNMOVED = Motion()
 
 @dataclass(frozen=True)
 class LabeledFrame:
-    """One frame with its labels.
+    """Frame with its labels.
 
     Attributes:
         frame_id: name of the frame in its dataset.
@@ -59,7 +59,7 @@ class LabeledFrame:
 def read_frame(
     split: LabeledSplit, frame_id: str, class_names: Sequence[str], *, camera_view: bool = True, min_points: int = 1
 ) -> LabeledFrame:
-    """Points and labelled boxes of one frame.
+    """Read points and labelled boxes of one frame.
 
     Objects of other types are left out; neighbors of a class (KITTI's Van for Car) and objects with too few points
     become IGNORED.
@@ -68,7 +68,7 @@ def read_frame(
         split: the dataset.
         frame_id: one of `split.frame_ids`.
         class_names: types that become labels 0, 1, ...
-        camera_view: keep only the points that the camera sees; KITTI labels nothing else.
+        camera_view: keep only the points within the camera image; KITTI labels nothing else.
         min_points: an object with fewer points inside its box is IGNORED.
 
     Raises:
@@ -85,6 +85,6 @@ def read_frame(
 
 
 def within_ranges(frame: LabeledFrame, ranges: Ranges) -> LabeledFrame:
-    """The frame without the boxes whose center lies outside `ranges`: no anchor stands where they are."""
+    """Return the frame without the boxes whose center is outside `ranges`, where there are no anchors."""
     inside = ranges.hold_centers(frame.boxes)
     return replace(frame, boxes=frame.boxes[inside], labels=frame.labels[inside])

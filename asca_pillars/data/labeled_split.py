@@ -1,7 +1,7 @@
-"""Interface of a dataset for training, inspection, insertion and evaluation, whatever its files look like.
+"""Interface of a dataset of any layout for training, inspection, insertion and evaluation.
 
 `data.kitti.KittiSplit` reads KITTI's layout, `data.boxes.box_split.BoxSplit` the layout with boxes in the LiDAR frame
-(docs/DATA.md); `data.open_split` tells them apart.
+(docs/DATA.md); `data.open_split` selects between them.
 """
 
 from collections.abc import Container
@@ -16,7 +16,7 @@ from asca_pillars.scans.mounting import Mounting
 
 
 class LabeledBoxes(NamedTuple):
-    """The M labelled boxes of a frame, (M, 7) float32, LiDAR frame, and the type of each."""
+    """M labelled boxes of a frame, (M, 7) float32, LiDAR frame, and the type of each."""
 
     boxes: NDArray[np.float32]
     types: tuple[str, ...]
@@ -35,11 +35,11 @@ class LabeledSplit(Protocol):
 
     @property
     def pool(self) -> str:
-        """Namespace of the frame ids: lists of one pool share what is computed per frame."""
+        """Namespace of the frame ids: lists of one pool share per-frame caches."""
 
     @property
     def has_camera(self) -> bool:
-        """True if objects are labelled only where a camera sees."""
+        """Whether objects are labelled only in a camera's field of view."""
 
     @property
     def mounting(self) -> Mounting:
@@ -51,44 +51,44 @@ class LabeledSplit(Protocol):
 
     @property
     def frame_ids(self) -> tuple[str, ...]:
-        """Sorted frame ids; DatasetError if the list is missing or wrong."""
+        """Sorted frame ids; DatasetError if the list is missing or invalid."""
 
     def scan_path(self, frame_id: str) -> Path:
-        """Path of the frame's scan, for messages; `points` reads it."""
+        """Return the path of the frame's scan, for messages; `points` reads it."""
 
     def input_paths(self, frame_id: str) -> tuple[Path, ...]:
-        """The files that the frame is read from: when one changes, what was computed from it is outdated."""
+        """Return the files that the frame is read from; caches are outdated when one changes."""
 
     def require_files(self) -> None:
         """Raise DatasetError unless every frame has its files: training would stop at the first that lacks one."""
 
     def points(self, frame_id: str, *, camera_view: bool) -> NDArray[np.float32]:
-        """(N, 4) x, y, z in m, LiDAR frame, and reflectance 0..1; only those in the camera's view if that is asked.
+        """Return (N, 4) x, y, z in m, LiDAR frame, and reflectance 0..1; with `camera_view` those in the camera's view.
 
-        Without a camera there is nothing to cut.
+        Without a camera nothing is cropped.
         """
 
     def in_labeled_view(self, frame_id: str, positions: NDArray[np.float32]) -> NDArray[np.bool_]:
-        """Mask of the positions (N, 3), metres, frame of `points`, where objects are labelled."""
+        """Return the mask of the positions (N, 3), metres, frame of `points`, where objects are labelled."""
 
     @property
     def one_reflectance_scale(self) -> bool:
-        """Whether `stored_points` have one scale for all scans; else reading decides it scan by scan."""
+        """Whether `stored_points` have one scale for all scans; otherwise it is decided for each scan."""
 
     def stored_points(self, frame_id: str) -> NDArray[np.float32]:
-        """(N, 4) all of the file, perhaps not finite or with a reflectance beyond 0..1."""
+        """Return all points (N, 4) of the file, possibly not finite or with a reflectance outside 0..1."""
 
     def points_state(self, frame_id: str) -> tuple[int, ...]:
-        """Numbers that change when `points` may."""
+        """Return numbers that change when `points` may change."""
 
     def label_types(self, frame_id: str) -> list[str]:
-        """The type of every label, also of those without a 3D box."""
+        """Return the type of every label, including those without a 3D box."""
 
     def label_yaws(self, frame_id: str) -> NDArray[np.float64]:
-        """(M,) yaw, or KITTI's rotation_y, of every label with a 3D box, radians if it is right, as it is stated."""
+        """Return the stated yaw (M,), or KITTI's rotation_y, of every label with a 3D box; radians unless invalid."""
 
     def labeled_boxes(self, frame_id: str, types: Container[str] | None = None) -> LabeledBoxes:
-        """The frame's boxes: those of `types`, or all that have a 3D box.
+        """Return the frame's boxes: those of `types`, or all that have a 3D box.
 
         Raises:
             DatasetError: missing or damaged labels; an object of `types` without a 3D box.

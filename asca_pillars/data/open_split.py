@@ -1,4 +1,4 @@
-"""Open datasets by the layout of their folder, and find the labels of a single scan."""
+"""Opening of datasets by the layout of their folder, and search for the labels of a single scan."""
 
 from functools import lru_cache
 from pathlib import Path
@@ -12,25 +12,25 @@ from asca_pillars.data.labeled_split import LabeledSplit
 
 
 def open_split(root: str | Path, name: str = "training") -> LabeledSplit:
-    """The layout of boxes if `root` holds a dataset.yaml, else KITTI's.
+    """Open a dataset: of the box layout if `root` contains a dataset.yaml, else of KITTI's.
 
     Args:
         root: the dataset's folder.
         name: a list in ImageSets/, or "training" for every frame.
 
     Raises:
-        ConfigError: dataset.yaml cannot be used.
+        ConfigError: dataset.yaml is invalid.
     """
     return BoxSplit(root, name) if (Path(root) / DATASET_FILE).is_file() else KittiSplit(root, name)
 
 
-DEPTH = 6  # folders above a scan in which a dataset.yaml is looked for
+DEPTH = 6  # folders above a scan that are searched for a dataset.yaml
 
 
 def labels_of_scan(scan: Path) -> NDArray[np.float32] | None:
-    """Labelled boxes (M, 7) in the scan's own frame, metres and radians; None if there are no labels.
+    """Return labelled boxes (M, 7) in the scan's own frame, metres and radians; None if there are no labels.
 
-    ../label_2 and ../calib of a scan in a folder velodyne/, or a dataset.yaml above the scan whose scans it is one of.
+    Labels are read from ../label_2 and ../calib of a scan in a folder velodyne/, or by a dataset.yaml above the scan.
 
     Raises:
         DatasetError, ConfigError: there are labels, but they are damaged.

@@ -1,4 +1,4 @@
-"""Check of the labels before a training, which would be in vain without a box that can be learnt."""
+"""Check of the labels before a training, which would fail without usable boxes."""
 
 from collections import Counter
 from dataclasses import dataclass, field
@@ -14,7 +14,7 @@ from asca_pillars.data.labeled_split import LabeledSplit
 from asca_pillars.data.yaw_units import check_yaws
 
 FRAMES_WITH_POINTS = 50
-"""Number of frames with boxes whose points are counted before all are taken to be without points."""
+"""Number of frames with boxes whose points are counted before all are assumed to have none."""
 
 
 FEWEST_FRAMES = 20
@@ -35,12 +35,12 @@ class _Labels:
 def require_boxes(split: LabeledSplit, config: Config, *, training: bool, bar: bool = True) -> list[str]:
     """Make sure that a list has boxes of the classes to be learnt; returns a line for each other problem.
 
-    That is a class without a box, and yaws that look like degrees. Frames are read only until every class was found.
+    These are a class without a box, and yaws that look like degrees. Frames are read until every class is found.
 
     Args:
         split: the training or the validation list.
         config: classes, ranges, and the points that a box needs.
-        training: whether it is refused if there is no box at all. A validation list is refused only if its labels spell
+        training: whether a list without any box is refused. A validation list is refused only if its labels spell
             the classes in another way.
         bar: show a progress bar on the terminal.
 

@@ -1,4 +1,4 @@
-"""The frames that a training sees, before they become tensors: read, with objects inserted, augmented."""
+"""Training frames before they become tensors: read, with objects inserted, augmented."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -17,17 +17,17 @@ from asca_pillars.detection.spec import DetectorSpec
 
 @dataclass(frozen=True)
 class TrainingFrames:
-    """Frames of one list, changed at random where `augmentation` is given.
+    """Frames of one list, augmented if `augmentation` is given.
 
     The result depends on the seed, the epoch and the frame alone.
 
     Attributes:
         split: the list.
-        spec: classes to be learnt.
-        camera_view: keep only the points that the camera sees.
+        spec: spec with the classes.
+        camera_view: keep only the points within the camera image.
         min_points: an object with fewer points inside its box is IGNORED.
         augmentation: random changes; None for validation.
-        inserter: puts objects of other frames in, before anything else is changed.
+        inserter: inserts objects of other frames before augmentation.
         seed: seed of all random draws.
     """
 
@@ -45,7 +45,7 @@ class TrainingFrames:
         return self.split.frame_ids
 
     def draw(self, epoch: int, number: int) -> tuple[LabeledFrame, np.random.Generator | None]:
-        """Frame `number` as it is in an epoch, and the generator that goes on from there; None without augmentation.
+        """Return frame `number` in an epoch, and the random generator after it; None without augmentation.
 
         Raises:
             DatasetError, ScanError: a file of the frame is missing or damaged.
@@ -59,7 +59,7 @@ class TrainingFrames:
             min_points=self.min_points,
         )
         if self.inserter is not None and self.inserter.settings.inserts_in(epoch):
-            # A generator of its own: all other draws stay what they are without insertion.
+            # A separate generator: all other random numbers are the same without insertion.
             frame = insert_objects(frame, self.inserter, np.random.default_rng((self.seed, epoch, number, 1)))
         if self.augmentation is not None and rng is not None:
             x_m, y_m, z_m = self.split.to_sensor.inverse.shift_m.tolist()
@@ -68,7 +68,7 @@ class TrainingFrames:
 
 
 def open_frames(root: str | Path, config: Config, *, training: bool) -> TrainingFrames:
-    """The training or the validation frames that `config` asks for; the object database is built if it is missing.
+    """Open the training or validation frames of `config`; the object database is built if it is missing.
 
     Raises:
         DatasetError: a missing list, scan, label or calibration file; a class to insert that no frame has.

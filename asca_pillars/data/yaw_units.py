@@ -1,4 +1,4 @@
-"""Yaws are radians: refuse or report those that look like degrees, which nothing else would reveal."""
+"""Check that yaws are in radians; values that look like degrees are refused or reported."""
 
 import math
 from collections.abc import Sequence
@@ -7,21 +7,21 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 LARGEST_YAW_RAD = 2 * math.pi + 0.01
-"""A yaw may be counted from -pi to pi or from 0 to 2 pi, and be rounded."""
+"""Yaws may be counted from -pi to pi or from 0 to 2 pi, and be rounded."""
 _ENOUGH = 2
-"""Least number of yaws other than 0 for a warning."""
+"""Least number of nonzero yaws for a warning."""
 _WHOLE = 1e-4
 
 
 def yaw_error(yaw: float) -> str | None:
-    """Clause for an error about a yaw that cannot be in radians; None if it can."""
+    """Return an error clause for a yaw that cannot be in radians; None if it can."""
     if abs(yaw) <= LARGEST_YAW_RAD:
         return None
     return f"is {yaw:g}, more than a turn of 6.28: radians are wanted; multiply degrees by pi / 180 (0.0174533)"
 
 
 def check_yaws(yaws: Sequence[ArrayLike]) -> str | None:
-    """Sentence for a warning if all yaws of a dataset, wrapped into a turn or not, are whole numbers; None if not.
+    """Return a warning if all yaws of a dataset, wrapped or not, are whole numbers; None if not.
 
     Zeros do not count: many boxes are labelled along the axes.
     """

@@ -16,7 +16,7 @@ from asca_pillars.evaluation.report_page import ReportPage
 
 @dataclass(frozen=True, kw_only=True)
 class EvaluationTask:
-    """What is evaluated and on what; the options of `asca eval` by the same names."""
+    """Data and options of an evaluation, named as the options of `asca eval`."""
 
     protocol: str
     model: Path | None = None
@@ -37,21 +37,21 @@ class EvaluationTask:
 
     @property
     def split_name(self) -> str:
-        """The list of frames."""
+        """Name of the list of frames."""
         return "val" if self.split is None else self.split
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """A finished evaluation.
+    """Finished evaluation.
 
     Attributes:
         protocol: kitti, waymo, iou, distance or tracking.
-        report: all figures, as in the JSON file.
-        page: the tables, which `page.markdown()` gives as text.
-        errors: the main tables of the error analysis; None if there was none.
-        out: folder of the files.
-        remarks: what is odd about the data, or was left out.
+        report: all results, as in the JSON file.
+        page: the tables; `page.markdown()` returns them as text.
+        errors: the main tables of the error analysis; None without one.
+        out: output folder.
+        remarks: warnings about the data, and what was left out.
     """
 
     protocol: str
@@ -63,12 +63,12 @@ class Evaluation:
 
 
 def default_protocol(data: Path | None) -> Literal["kitti", "iou"]:
-    """KITTI's, unless the dataset has no camera."""
+    """Return "kitti", or "iou" for a dataset without a camera."""
     return "kitti" if data is None or isinstance(open_split(data), KittiSplit) else "iou"
 
 
 def check_arguments(given: EvaluationTask) -> None:
-    """Refuse options that do not go together, with a ConfigError that says which and what to do."""
+    """Refuse incompatible options with a ConfigError that names them and the remedy."""
     if given.split is not None and given.data is None:
         raise ConfigError(f"--split {given.split} is a list of the frames of a dataset: give --data ROOT, too")
     _check_errors(given)
@@ -85,7 +85,7 @@ def check_arguments(given: EvaluationTask) -> None:
         _check_kitti(given)
     scores = given.score.values() if isinstance(given.score, Mapping) else [given.score or 0.0]
     if wrong := [score for score in scores if not math.isfinite(score)]:
-        raise ConfigError(f"--score {wrong[0]} must be a number")  # any: predictions from elsewhere may hold logits
+        raise ConfigError(f"--score {wrong[0]} must be a number")  # any number, since others may be logits
 
 
 def _check_errors(given: EvaluationTask) -> None:
@@ -125,7 +125,7 @@ def _check_boxes(given: EvaluationTask) -> None:
 
 
 def _check_no_text(given: EvaluationTask) -> None:
-    """What only labels as KITTI text have."""
+    """Refuse options that only labels as KITTI text have."""
     if given.labels is not None:
         raise ConfigError(f"--labels {given.labels} belongs to --protocol kitti and waymo; give --data ROOT alone")
     if given.gallery:
@@ -173,5 +173,5 @@ def _check_compare(compare: Path, given: EvaluationTask) -> None:
 
 
 def _typed(score: ScoreThresholds) -> str:
-    """As a user would type it, the first one of several."""
+    """Return a score threshold as typed on the command line, the first one of several."""
     return next(f"{name}={value:g}" for name, value in score.items()) if isinstance(score, Mapping) else f"{score:g}"

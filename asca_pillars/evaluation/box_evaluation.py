@@ -1,4 +1,4 @@
-"""Evaluation by IoU or by distance: any class, boxes in the LiDAR frame, no camera."""
+"""Evaluation by IoU or center distance: any class, boxes in the LiDAR frame, no camera."""
 
 from pathlib import Path
 from typing import Any
@@ -51,7 +51,7 @@ def evaluate_boxes(
         scores = scores_by_class(task.score, dict.fromkeys(class_names, TEXT_SCORE))
         subject, about = f"{predictions} against {data}", about | {"predictions": str(predictions)}
     _require_common_class(frames, class_names, data)
-    level = split.mounting.level.inverse  # yaws as files state them
+    level = split.mounting.level.inverse  # yaws as stated in files
     warn_of_degrees(
         reporter,
         labels=[split.label_yaws(frame.frame_id) for frame in frames.frames],
@@ -73,7 +73,7 @@ def evaluate_boxes(
 
 
 def _run(model: Model, split: LabeledSplit, task: EvaluationTask, reporter: Reporter) -> BoxFrames:
-    """Run the model and write what it finds: what is scored is read from there, so that it can be scored again."""
+    """Run the model and write its predictions: these files are evaluated, so that they can be evaluated again."""
     with atomic_directory(task.out / "predictions", *PREDICTIONS_FOLDER) as folder:
         camera_view = split.has_camera and model.camera_view
         write_box_predictions(

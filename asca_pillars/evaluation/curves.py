@@ -1,4 +1,4 @@
-"""Precision-recall curves as a picture; the only part of the evaluation that needs matplotlib."""
+"""Plot of precision-recall curves; the only part of the evaluation that needs matplotlib."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -24,14 +24,14 @@ def write_curves(path: str | Path, results: KittiResults, title: str) -> None:
     recall that was reached.
 
     Args:
-        path: of the PNG.
-        results: with the curves; a class without any gets an empty plot that says so.
-        title: of the whole picture.
+        path: path of the PNG.
+        results: results with the curves; a class without any gets an empty plot with a note.
+        title: title of the picture.
 
     Raises:
         ModuleNotFoundError: matplotlib is not installed.
     """
-    # Neither pyplot nor its backends: a figure of its own leaves no global state and needs no display.
+    # No pyplot and no backend: a Figure object has no global state and needs no display.
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 

@@ -1,6 +1,6 @@
-"""Frames as pictures: what was missed and what was seen where nothing is, from above and on the image.
+"""Pictures of frames with missed objects and false positives, in bird's-eye view and on the image.
 
-Of one detector the worst frames; of two those in which they differ most, side by side.
+The worst frames of one detector, or for two the frames in which they differ most, side by side.
 """
 
 from collections.abc import Sequence
@@ -43,7 +43,7 @@ _HEADING_PX = 34
 
 @dataclass(frozen=True)
 class _Kind:
-    """Boxes of one outcome: whose they are, how they look, and what is written beside them."""
+    """Outcome of boxes with their source, style and caption."""
 
     title: str
     color: Color
@@ -51,7 +51,7 @@ class _Kind:
     thickness_px: int
 
 
-# Most important first: what is on top in the picture and first in its legend.
+# Most important first: on top in the picture and first in its legend.
 _MISSED = _Kind("missed", (70, 70, 255), "missed {type}", 5)
 _FALSE = _Kind("false", (255, 110, 255), "{type} {score:.2f}", 5)
 _FOUND = _Kind("found", (255, 255, 255), "", 2)
@@ -65,7 +65,7 @@ Matches = Sequence[ScoreMatches]
 
 @dataclass(frozen=True)
 class Judged:
-    """A detector: its name, the folder of its predictions as KITTI text, and how they match the labels."""
+    """Detector: its name, the folder of its predictions as KITTI text, and their matches with the labels."""
 
     name: str
     predictions: Path
@@ -73,15 +73,15 @@ class Judged:
 
 
 def worst_frames(frames: Sequence[ScoreMatches], count: int) -> list[ScoreMatches]:
-    """The `count` frames with most misses and false detections, worst first; frames without any are left out."""
+    """Return the `count` frames with most misses and false positives, worst first; frames without any are left out."""
     wrong = [frame for frame in frames if frame.errors]
     return sorted(wrong, key=lambda frame: (-frame.errors, frame.frame_id))[:count]
 
 
 def most_different_frames(first: Matches, second: Matches, count: int) -> list[tuple[ScoreMatches, ScoreMatches]]:
-    """The matches of two detectors in the `count` frames in which they differ most, the most different first.
+    """Return the matches of two detectors in the `count` frames in which they differ most, most different first.
 
-    Frames that one of them lacks, and those without any difference, are left out.
+    Frames that one of them lacks, and those without differences, are left out.
     """
     there = {frame.frame_id: frame for frame in second}
     pairs = [(frame, there[frame.frame_id]) for frame in first if frame.frame_id in there]
@@ -90,7 +90,7 @@ def most_different_frames(first: Matches, second: Matches, count: int) -> list[t
 
 
 def _difference(first: ScoreMatches, second: ScoreMatches) -> int:
-    """Number of objects that only one of the two finds, plus the difference of their false detections."""
+    """Return the number of objects found by only one of the two, plus the difference of their false positives."""
     found = np.logical_xor(first.found, second.found).sum()
     return int(found) + abs(int(first.false_positive.sum()) - int(second.false_positive.sum()))
 
@@ -110,11 +110,11 @@ def write_gallery(
     Args:
         folder: for the pictures.
         detectors: one, whose worst frames are drawn, or two, of which the frames that differ most are.
-        count: of the frames, at most.
+        count: largest number of frames.
         split: the scans, calibrations and images.
-        labels: the folder of KITTI text that they were judged by.
-        ranges: what the pictures show.
-        reporter: of the progress.
+        labels: folder of KITTI text with the labels.
+        ranges: ranges of the pictures.
+        reporter: for the progress.
 
     Raises:
         DatasetError, ScanError: a frame's scan, calibration or text cannot be read.
@@ -180,7 +180,7 @@ def _layers(
 
 
 def _headed(picture: Image, text: str) -> Image:
-    """The picture below a line of text, its end if there is no room for all, and with a border on its right."""
+    """Return the picture below a line of text, truncated at its start if too long, with a border on the right."""
     bar = np.full((_HEADING_PX, picture.shape[1], 3), BACKGROUND, np.uint8)
     texts = Texts(bar, 0.6)
     while texts.size(text)[0] > picture.shape[1] - 32:
@@ -207,7 +207,7 @@ def _draw_on(image: Image, layers: Sequence[BoxLayer], calibration: Calibration)
 
 
 def _below(picture: Image, image: Image) -> Image:
-    """The image under the picture, as wide as that."""
+    """Return the image below the picture, scaled to its width."""
     width = picture.shape[1]
     height = round(image.shape[0] * width / image.shape[1])
     return np.vstack([picture, cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)]).astype(np.uint8)

@@ -53,7 +53,7 @@ from asca_pillars.geometry.ranges import Ranges
 from asca_pillars.ops.pillar.grid import PillarGrid
 
 GALLERY_FRAMES = 8
-TEXT_SCORE = 0.3  # KITTI text does not say from which score on its detector would report
+TEXT_SCORE = 0.3  # KITTI text does not state the detector's score threshold
 
 
 def evaluate_text(task: EvaluationTask, open_model: OpenModel, reporter: Reporter) -> Evaluation:
@@ -93,7 +93,7 @@ def evaluate_text(task: EvaluationTask, open_model: OpenModel, reporter: Reporte
 
 @dataclass(frozen=True)
 class Task:
-    """Predictions and labels to compare, from where they are, and where their scans are if anywhere."""
+    """Predictions and labels to compare, their source, and the folder of their scans if any."""
 
     subject: str
     predictions: Path
@@ -105,14 +105,14 @@ class Task:
 
 
 def text_task(predictions: Path, labels: Path, split: KittiSplit | None, score: ScoreThresholds | None) -> Task:
-    """Finished predictions as KITTI text, counted from `score` on."""
+    """Return the task of finished predictions as KITTI text, with the score threshold `score`."""
     scores = scores_by_class(score, dict.fromkeys(CLASS_NAMES, TEXT_SCORE))
     about = {"predictions": str(predictions), "labels": str(labels)}
     return Task(f"{predictions} against {labels}", predictions, labels, split, PillarGrid().ranges, scores, about)
 
 
 def check_classes(task: Task, frames: ScoredFrames) -> None:
-    """Refuse what KITTI's protocol has nothing to say about; the report names single classes that are left out."""
+    """Refuse labels and predictions without any of KITTI's classes; the report names other classes left out."""
     known = {name.casefold() for name in CLASS_NAMES}
     if frames.foreign_types and not any(
         known & set(frame.folded_types.tolist()) for frame in (*frames.truth, *frames.detections)
@@ -125,7 +125,7 @@ def check_classes(task: Task, frames: ScoredFrames) -> None:
 
 
 def kitti_scores(model: Model, score: ScoreThresholds | None, min_score: float) -> dict[str, float]:
-    """For each class the score from which on detections count for precision and recall."""
+    """Return the score threshold of each class for precision and recall."""
     known = {name.lower(): name for name in CLASS_NAMES}
     scores = dict.fromkeys(CLASS_NAMES, TEXT_SCORE)
     if not any(item.name.lower() in known for item in model.spec.classes):
@@ -134,7 +134,7 @@ def kitti_scores(model: Model, score: ScoreThresholds | None, min_score: float) 
             f"{', '.join(CLASS_NAMES)}: give --protocol waymo, which scores any class"
         )
     for name, fixed in model_scores(model, score, min_score).items():
-        if name.lower() in known:  # the report names others
+        if name.lower() in known:  # the report names other classes
             scores[known[name.lower()]] = fixed
     return scores
 
@@ -156,7 +156,7 @@ def warn_of_degrees(reporter: Reporter, **yaws: Sequence[NDArray[np.floating]]) 
 
 
 def warn_of_degrees_in_text(reporter: Reporter, frames: ScoredFrames) -> None:
-    """The same of rotation_y; objects without a 3D box have none."""
+    """Warn of rotation_y in degrees; objects without a 3D box are left out."""
     labels, predictions = (
         [frame.rotation_y[(frame.dimensions_hwl > 0).all(axis=1)] for frame in side]
         for side in (frames.truth, frames.detections)
@@ -167,7 +167,7 @@ def warn_of_degrees_in_text(reporter: Reporter, frames: ScoredFrames) -> None:
 def run_model(
     model: Model, split: KittiSplit, labels: Path, scores: dict[str, float], out: Path, reporter: Reporter
 ) -> Task:
-    """Write the model's predictions to `out`: what is scored is read from there, so that it can be scored again."""
+    """Write the model's predictions to `out`: these files are evaluated, so that they can be evaluated again."""
     about = {"model": model.about, "data": str(split.root), "split": split.name}
     with atomic_directory(out / "predictions", *PREDICTIONS_FOLDER) as folder:
         write_predictions(folder, split, model.detect, camera_view=model.camera_view, reporter=reporter)
@@ -237,12 +237,12 @@ def draw_gallery(
     """Draw `count` frames below `out`, if there are scans to draw.
 
     Args:
-        task: what was evaluated.
+        task: predictions and labels.
         frames: its labels and predictions.
-        out: of the evaluation.
+        out: output folder of the evaluation.
         count: None for GALLERY_FRAMES.
-        compare: KITTI text of another detector, which is drawn beside the first; None: the frames with most errors.
-        reporter: of the progress.
+        compare: KITTI text of another detector, drawn next to the first; None: the frames with most errors.
+        reporter: for the progress.
 
     Raises:
         DatasetError, ScanError: predictions of the other detector, or a frame, cannot be read.
@@ -257,7 +257,7 @@ def draw_gallery(
 
 
 def _named_apart(own: gallery.Judged, task: Task, other: gallery.Judged) -> list[gallery.Judged]:
-    """Both, by the names of their models; with their folders where these are the same."""
+    """Return both detectors named by their models, or by their folders if these are the same."""
     both = [replace(own, name=_name(task.about, task.predictions)), other]
     if both[0].name == both[1].name:
         both = [replace(one, name=f"{one.name}, {one.predictions}") for one in both]
@@ -265,7 +265,7 @@ def _named_apart(own: gallery.Judged, task: Task, other: gallery.Judged) -> list
 
 
 def _other(compare: Path, task: Task, frames: ScoredFrames, reporter: Reporter) -> gallery.Judged:
-    """The detector whose predictions lie in a folder, at its own scores where an evaluation of it states them."""
+    """Return the detector of a folder of predictions, at its own scores if an evaluation of it states them."""
     about = _made_by(compare)
     found = read_predictions(compare, frames.truth, task.labels, reporter=reporter)
     if found.shortage is not None:
@@ -278,7 +278,7 @@ def _judged(frames: ScoredFrames, scores: dict[str, float]) -> gallery.Matches:
 
 
 def _made_by(folder: Path) -> dict[str, Any]:
-    """Read what an evaluation noted beside the predictions of its model; nothing where they are from elsewhere."""
+    """Read an evaluation's notes on the predictions of its model; empty for predictions of other programs."""
     try:
         content = json.loads((folder / MADE_BY).read_text(encoding="utf-8"))
     except (OSError, ValueError):
@@ -287,7 +287,7 @@ def _made_by(folder: Path) -> dict[str, Any]:
 
 
 def _stated_scores(about: dict[str, Any]) -> dict[str, float]:
-    """The score of each class from which on its detections count, as far as that is stated."""
+    """Return the stated score threshold of each class."""
     scores = about.get("scores")
     if not isinstance(scores, dict):
         return {}

@@ -1,4 +1,4 @@
-"""A detector under evaluation, and the scores from which its detections count."""
+"""Detector under evaluation, and its score thresholds."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -12,20 +12,20 @@ from asca_pillars.detection.detections import Detections
 from asca_pillars.detection.spec import DetectorSpec, ScoreThresholds
 
 MIN_SCORE = 0.05
-"""Lowest score that a model is evaluated with, unless another is given."""
+"""Default lowest score of an evaluated model's detections."""
 
 
 @dataclass(frozen=True)
 class Model:
-    """A detector and what is to be known about it.
+    """Detector and its properties.
 
     Attributes:
-        name: of the model.
+        name: name of the model.
         detect: (N, 4) points -> detections, from `min_score` on.
-        spec: as the model was made, with its own thresholds.
+        spec: spec of the model, with its own thresholds.
         camera_view: whether it expects only the points in the image.
-        about: where it comes from and where it runs, for the report.
-        unlike: for each scan that does not look like those of the training, the first reason.
+        about: its source and device, for the report.
+        unlike: the first warning of each scan that is unlike the training scans.
     """
 
     name: str
@@ -37,14 +37,14 @@ class Model:
 
 
 OpenModel: TypeAlias = Callable[[float | None], Model]
-"""Opens the model to evaluate for scans of a sensor of this height, metres; None: as high as in the training."""
+"""Opener of the model to evaluate, for scans of a sensor of this height, metres; None: as in the training scans."""
 
 
 def model_scores(model: Model, score: ScoreThresholds | None, min_score: float) -> dict[str, float]:
-    """For each of the model's classes the score from which on detections count for precision and recall.
+    """Return the score threshold of each of the model's classes, for precision and recall.
 
     Raises:
-        ConfigError: a score that the model is not run down to.
+        ConfigError: a score below the lowest score of the model's detections.
     """
     scores = scores_by_class(score, {item.name: item.score_threshold for item in model.spec.classes})
     for name, fixed in scores.items():
@@ -59,10 +59,10 @@ def model_scores(model: Model, score: ScoreThresholds | None, min_score: float) 
 
 
 def scores_by_class(stated: ScoreThresholds | None, defaults: Mapping[str, float]) -> dict[str, float]:
-    """The score of each class of `defaults`: as stated, else that one.
+    """Return the score of each class of `defaults`: the stated one, or the default.
 
     Raises:
-        ConfigError: a stated class is none of them.
+        ConfigError: a stated class is not among them.
     """
     if not isinstance(stated, Mapping):
         return dict(defaults) if stated is None else dict.fromkeys(defaults, stated)

@@ -1,7 +1,7 @@
-"""Predictions to be scored: KITTI text that is read beside its labels, or written by a detector run over a split.
+"""Predictions to be evaluated: KITTI text read with its labels, or written by a detector run over a split.
 
-The official tool evaluates the frames that have a detection file. So does this one, and says which frames that leaves
-out: a frame without detections needs an empty file.
+As in the official tool, the frames with a detection file are evaluated. The others are reported: a frame without
+detections needs an empty file.
 """
 
 from collections import Counter
@@ -26,7 +26,7 @@ FOLDED_KITTI_TYPES = frozenset(name.casefold() for name in KITTI_TYPES)
 
 @dataclass(frozen=True)
 class ScoredFrames:
-    """Labels and predictions of the same frames in the same order, and the frames that have no prediction file."""
+    """Labels and predictions of the same frames in the same order, and the frames without a prediction file."""
 
     truth: tuple[FrameObjects, ...]
     detections: tuple[FrameObjects, ...]
@@ -37,21 +37,21 @@ class ScoredFrames:
 
     @property
     def asked(self) -> int:
-        """Frames that were to be evaluated."""
+        """Number of frames that were to be evaluated."""
         return len(self.truth) + len(self.without_predictions)
 
     @property
     def shortage(self) -> str | None:
-        """One sentence that belongs beside every number if not all frames were evaluated; None if all were."""
+        """Sentence to print with every result if not all frames were evaluated; None if all were."""
         return shortage(len(self), self.without_predictions, "no prediction file", "needs an empty file")
 
     def titled(self, subject: str) -> str:
-        """The subject, and how many frames stand behind its numbers, or which ones are missing."""
+        """Return the subject with the number of its frames, or the missing ones."""
         return f"{subject}: {self.shortage or f'{len(self)} frames'}"
 
     @property
     def foreign_types(self) -> dict[str, tuple[int, int]]:
-        """Types that KITTI does not have, as first written: how many labels and how many detections name them."""
+        """Types that KITTI does not have, as first spelt: the numbers of labels and detections."""
         names: dict[str, str] = {}
         counts = Counter[tuple[str, int]]()
         for side, frames in enumerate((self.truth, self.detections)):
@@ -66,7 +66,7 @@ class ScoredFrames:
 
 
 def shortage(evaluated: int, without: Sequence[str], missing: str, remedy: str) -> str | None:
-    """That frames without predictions were left out, what they lack, and what one without detections would have.
+    """Return a sentence about frames without predictions, what they lack, and the remedy.
 
     None if there is no such frame.
     """
@@ -81,7 +81,7 @@ def shortage(evaluated: int, without: Sequence[str], missing: str, remedy: str) 
 
 
 def read_truth(folder: str | Path, frame_ids: Sequence[str] | None = None) -> list[FrameObjects]:
-    """The labels of a folder, those of `frame_ids` or of every file in it, by frame id.
+    """Read the labels of a folder, those of `frame_ids` or of every file in it, by frame id.
 
     Raises:
         DatasetError: a missing or empty folder, a missing or damaged file; names file, line, value and remedy.
@@ -101,7 +101,7 @@ def read_predictions(
         folder: with NAME.txt of 16 fields per line.
         truth: labels of the frames to be evaluated.
         labels: the folder that they are from.
-        reporter: of the progress.
+        reporter: for the progress.
 
     Raises:
         DatasetError: as `read_truth`; a line without a score; a prediction without labels.
@@ -136,16 +136,16 @@ def write_predictions(
     camera_view: bool = True,
     reporter: Reporter = SILENT,
 ) -> None:
-    """Run a detector over a split and write what the camera sees as KITTI text, one file per frame.
+    """Run a detector over a split and write its detections in the image as KITTI text, one file per frame.
 
-    KITTI labels nothing outside the image, so detections there cannot be judged and are left out.
+    KITTI labels nothing outside the image, so detections there cannot be evaluated and are left out.
 
     Args:
-        folder: for NAME.txt of each frame, an empty file where nothing was found.
+        folder: folder for NAME.txt of each frame, an empty file without detections.
         split: the frames; their scans and calibrations are read, their labels are not.
         detect: (N, 4) points -> detections, for instance `asca_deploy.Detector` or `models.scan_detector.ScanDetector`.
-        camera_view: give the detector only the points in the image, as it has seen in training.
-        reporter: of the progress.
+        camera_view: give the detector only the points in the image, as in its training.
+        reporter: for the progress.
 
     Raises:
         DatasetError, ScanError: a frame cannot be read.
@@ -186,6 +186,6 @@ def _read_frame(folder: Path, frame_id: str, *, scored: bool) -> FrameObjects:
 
 
 def _place(path: Path, index: int) -> str:
-    """FILE:LINE of an object: empty lines are not objects."""
+    """Return FILE:LINE of an object: empty lines are not objects."""
     lines = read_text(path, DatasetError, errors="replace").splitlines()
     return f"{path}:{[number for number, line in enumerate(lines, start=1) if line.strip()][index]}"

@@ -1,7 +1,7 @@
-"""Recall and false detections per frame at a fixed score: what one watches while training.
+"""Recall and false positives per frame at a fixed score, for monitoring of training.
 
-The official KITTI protocol ranks detections by score over a whole set; this one describes a detector that
-runs at its thresholds.
+The official KITTI protocol ranks detections by score over a whole set; these metrics describe a detector
+at its thresholds.
 """
 
 from collections.abc import Sequence
@@ -14,12 +14,12 @@ from asca_pillars.detection.detections import Detections
 from asca_pillars.detection.targets import match_by_overlap
 from asca_pillars.geometry.overlap import bev_iou
 
-BEV_IOU = {"Car": 0.5}  # every other class is as small as a person: 0.25
+BEV_IOU = {"Car": 0.5}  # 0.25 for the others, which are as small as a person
 SMALL_BEV_IOU = 0.25
 
 
 class RecallRow(NamedTuple):
-    """Counts of one class, and what follows from them."""
+    """Counts of one class, and ratios of them."""
 
     objects: int
     found: int
@@ -28,19 +28,19 @@ class RecallRow(NamedTuple):
 
     @property
     def recall(self) -> float:
-        """Share of the objects that were found; NaN without objects."""
+        """Fraction of the objects that were found; NaN without objects."""
         return self.found / self.objects if self.objects else float("nan")
 
     @property
     def false_per_frame(self) -> float:
-        """False detections per frame."""
+        """False positives per frame."""
         return self.false / max(self.frames, 1)
 
 
 class RecallTally:
-    """Counts objects found and false detections, frame by frame.
+    """Accumulator of objects, found objects and false positives, frame by frame.
 
-    Processes that see different frames add up their `counts`: recall is the ratio of the sums, not a mean of ratios.
+    Processes with different frames add up their `counts`: recall is the ratio of the sums, not a mean of ratios.
 
     Args:
         class_names: names of labels 0, 1, ...
@@ -51,7 +51,7 @@ class RecallTally:
 
     Attributes:
         counts: (C + 1, 3) int64. A row of objects, found and false for each class; the last row is the number of
-            frames, 0, 0. Sums of such arrays are such arrays.
+            frames, 0, 0. Such arrays can be added.
     """
 
     def __init__(self, class_names: Sequence[str], counts: NDArray[np.integer] | None = None) -> None:
@@ -63,7 +63,7 @@ class RecallTally:
 
     @property
     def frames(self) -> int:
-        """Number of frames that were counted."""
+        """Number of counted frames."""
         return int(self.counts[-1, 0])
 
     def add(self, detections: Detections, boxes: NDArray[np.float32], labels: NDArray[np.int64]) -> None:
@@ -86,7 +86,7 @@ class RecallTally:
             )
 
     def rows(self) -> dict[str, RecallRow]:
-        """One row per class."""
+        """Return one row per class."""
         return {
             name: RecallRow(int(objects), int(found), int(false), self.frames)
             for name, (objects, found, false) in zip(self.class_names, self.counts[:-1], strict=True)
@@ -99,6 +99,6 @@ def _count(
     counted: NDArray[np.bool_],
     min_iou: float,
 ) -> tuple[int, int, int]:
-    """Objects, found and false detections of one class in one frame; detections by descending score."""
+    """Count objects, found objects and false positives of one class in one frame; detections by descending score."""
     matched, objects = match_by_overlap(bev_iou(detections, boxes), min_iou)
     return int(counted.sum()), int(counted[objects].sum()), len(detections) - len(matched)

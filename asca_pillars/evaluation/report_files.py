@@ -1,4 +1,4 @@
-"""What `asca eval` writes, whatever the protocol: a page of tables, its JSON, and the predictions of its own run."""
+"""Output files of `asca eval`: a page of tables, its JSON, and the predictions of its own run."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -32,7 +32,7 @@ REPORTS = {
     "distance": json_object("subject", "shortage", "nuscenes", "at_score", protocol="distance"),
     "tracking": json_object("subject", "frames_found", "not_scored", "classes"),
 }
-"""The JSON of each report, by the name of its file."""
+"""Recognizer of the JSON of each report, by the name of its file."""
 _PAGE_END = page_end(COMMAND)
 _PRODUCTS: dict[str, Recognizer] = {
     **{f"{name}.json": is_own for name, is_own in REPORTS.items()},
@@ -42,9 +42,9 @@ _PRODUCTS: dict[str, Recognizer] = {
 }
 MADE_BY = "made_by.json"
 PREDICTIONS_FOLDER = (COMMAND, MADE_BY, json_object("model", "data", "split", "files"))
-"""Command, marker and its recognizer of the folder of a model's predictions, as `atomic_directory` takes them."""
+"""Command, marker and recognizer of the folder of a model's predictions, as for `atomic_directory`."""
 GALLERY_FOLDER = (COMMAND, gallery.INDEX, ending_with(gallery.INDEX_END))
-"""The same of the folder of pictures."""
+"""Command, marker and recognizer of the folder of pictures."""
 
 
 def claim(
@@ -57,14 +57,14 @@ def claim(
     """Make sure that nothing but earlier evaluations is replaced, and none of the inputs.
 
     Args:
-        name: of the report, see REPORTS.
-        out: to be written into.
-        json_path: of a copy of the JSON; None for none.
-        predictions: that are evaluated, perhaps those that an earlier evaluation left in `out`; None: a model is run.
-        inputs: what else is read; None is no input.
+        name: name of the report, see REPORTS.
+        out: output folder.
+        json_path: path of a copy of the JSON; None for none.
+        predictions: evaluated predictions, possibly those of an earlier evaluation in `out`; None: a model is run.
+        inputs: other files that are read; None is ignored.
 
     Raises:
-        OutputError, OSError: names what is in the way.
+        OutputError, OSError: a file cannot be replaced; names it.
     """
     inputs = list(inputs)
     require_own(out, COMMAND, {**_PRODUCTS, f"predictions/{MADE_BY}": PREDICTIONS_FOLDER[2]})
@@ -94,12 +94,12 @@ def write_report(
     An earlier evaluation's analysis of errors is removed.
 
     Args:
-        name: of the files, see REPORTS.
-        page: what is written as Markdown.
-        content: what is written as JSON.
-        out: of the evaluation, see `claim`.
+        name: name of the files, see REPORTS.
+        page: contents of the Markdown file.
+        content: contents of the JSON file.
+        out: output folder of the evaluation, see `claim`.
         json_path: None for no other copy.
-        scored: the predictions that it is about; those that an earlier evaluation left in `out` are removed.
+        scored: evaluated predictions; those of an earlier evaluation in `out` are removed.
 
     Raises:
         OutputError, OSError: something cannot be written or removed.

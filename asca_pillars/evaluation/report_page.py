@@ -1,4 +1,4 @@
-"""A report of an evaluation as people read it: the same tables on the console and as Markdown."""
+"""Report of an evaluation for people: the same tables on the console and as Markdown."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,7 +9,7 @@ from rich.table import Table
 
 @dataclass(frozen=True)
 class TextTable:
-    """A table of texts; the first `left` columns are names, the others numbers. Line breaks are for the console."""
+    """Table of texts; the first `left` columns are names, the others numbers. Line breaks are for the console."""
 
     title: str
     columns: tuple[str, ...]
@@ -19,16 +19,16 @@ class TextTable:
 
 @dataclass(frozen=True)
 class ReportPage:
-    """A title, tables, and what one must know to read them."""
+    """Title, tables and notes."""
 
     title: str
     tables: Sequence[TextTable]
     notes: Sequence[str]
 
     def print(self, console: Console) -> None:
-        """On the console; a name that the row above has is not repeated.
+        """Print the page; a name equal to that of the row above is not repeated.
 
-        A table is wider than the console rather than cut a figure or a word.
+        A table may be wider than the console, so that no number or word is truncated.
         """
         console.print(self.title, style="bold", highlight=False, soft_wrap=True)
         for table in self.tables:
@@ -49,7 +49,7 @@ class ReportPage:
             console.print(line, highlight=False, soft_wrap=True)
 
     def markdown(self) -> str:
-        """As a Markdown page."""
+        """Return the page as Markdown."""
         parts = [f"# {self.title}\n"]
         for table in self.tables:
             columns = [column.replace("\n", " ") for column in table.columns]
@@ -60,6 +60,6 @@ class ReportPage:
 
 
 def markdown_table(columns: Sequence[str], rows: Sequence[Sequence[str]], left: int) -> str:
-    """A table as Markdown; the first `left` columns are names, the others numbers."""
+    """Return a table as Markdown; the first `left` columns are names, the others numbers."""
     ruler = ["---" if index < left else "---:" for index in range(len(columns))]
     return "".join(f"| {' | '.join(cells)} |\n" for cells in (columns, ruler, *rows))

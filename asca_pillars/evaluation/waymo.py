@@ -1,32 +1,32 @@
-"""Detection metrics of the Waymo Open Dataset: AP, and APH, in which a find of wrong heading weighs less.
+"""Detection metrics of the Waymo Open Dataset: AP, and APH, in which true positives are weighted by heading accuracy.
 
 Definition: P. Sun et al., "Scalability in Perception for Autonomous Driving: Waymo Open Dataset", CVPR 2020
-(arXiv 1912.04838); where that is brief, the dataset's own evaluation tool decides:
+(arXiv 1912.04838); for details, the dataset's own evaluation tool:
 
 - Boxes match by a 3D IoU of at least 0.7 for vehicles and 0.5 for every other class, one to one within a frame and a
-  class, so that the sum of IoU is greatest. Scores take no part in it: for each cutoff 0, 0.01, ..., 1 the detections
-  that reach it are matched anew.
-- What holds no LiDAR point is no object. Up to 5 points make an object LEVEL_2. At LEVEL_2
-  every object counts. At LEVEL_1 an unfound LEVEL_2 object is not missed, but one that was found is a find
+  class, with the largest sum of IoU. Scores do not affect it: for each cutoff 0, 0.01, ..., 1 the detections
+  with at least that score are matched anew.
+- Labels without a LiDAR point are not counted. Objects with up to 5 points are LEVEL_2. At LEVEL_2
+  every object counts. At LEVEL_1 an unfound LEVEL_2 object is not missed, but a found one is a true positive
   like any other, in the precision and on both sides of the recall.
-- A find has the heading accuracy 1 - d / pi, d in [0, pi] being the difference of the headings. APH puts the sum of
-  these in place of the number of finds, in the precision but not in the recall.
-- Precision at a recall is the best at that recall or beyond. The area under it is that of trapezoids, but between
+- A true positive has the heading accuracy 1 - d / pi, d in [0, pi] being the difference of the headings. APH uses the
+  sum of these instead of the number of true positives, in the precision but not in the recall.
+- Precision at a recall is the maximum at that recall or higher. The area under it is that of trapezoids, but between
   recalls more than 0.05 apart precision falls only in the last step, which is at most 0.05 wide.
-- A range keeps the objects *and* the detections whose own centers lie in it, by 3D distance from the origin; what
-  stands on two sides of a limit does not match.
-- A detection in a no-label zone is no false positive if it matches nothing.
+- A range keeps the objects *and* the detections whose own centers are in it, by 3D distance from the origin; boxes
+  on two sides of a limit do not match.
+- An unmatched detection in a no-label zone is not a false positive.
 
-Table 7 of AFE-RCNN (2022) lists vehicles and cyclists, both levels, over all ranges; its text lets 5 points be LEVEL_1,
-which the tool does not.
+Table 7 of AFE-RCNN (2022) lists vehicles and cyclists, both levels, over all ranges; its text counts objects with 5
+points as LEVEL_1, unlike the tool.
 
-Departures: a level without objects has no AP (the tool says 0, or goes by the LEVEL_2 objects that were found). Where
-several matchings have the same sum of IoU, the tool takes one that depends on the order in the file, false positives
-included: its matching is complete, and a detection that reaches no object may occupy one at weight 0. It also rounds
-IoU to 1e-6, which makes more sums equal. Here the order of detections of unlike scores has no influence: the higher
-score keeps its object, and of equal objects the first one is taken. LEVEL_1 can differ by this, because it matters
-there whether an object of LEVEL_1 or of LEVEL_2 is left over, and so can APH. Papers that let the tool choose 11
-cutoffs by the distribution of the scores get somewhat different figures.
+Differences: a level without objects has no AP (the tool gives 0, or uses the LEVEL_2 objects that were found). Where
+several matchings have the same sum of IoU, the tool's depends on the order in the file, false positives
+included: its matching is complete, and a detection that overlaps no object may be assigned one at weight 0. It also
+rounds IoU to 1e-6, so that more sums are equal. Here the order of detections of different scores has no influence: the
+higher score keeps its object, and of equal objects the first one is matched. LEVEL_1 can differ by this, because it
+matters there whether an unmatched object is of LEVEL_1 or of LEVEL_2, and so can APH. Papers that let the tool choose
+11 cutoffs by the distribution of the scores get slightly different results.
 """
 
 from collections.abc import Sequence
@@ -68,7 +68,7 @@ _Doubles = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class WaymoTruth:
-    """The N labelled objects of one frame.
+    """N labelled objects of one frame.
 
     Raises:
         ValueError: if the arrays do not describe the same number of objects.
@@ -77,7 +77,7 @@ class WaymoTruth:
     boxes: NDArray[np.floating]
     """(N, 7) x, y, z, length, width, height, yaw; metres and radians, vehicle (or LiDAR) frame."""
     labels: NDArray[np.int64]
-    """(N,) indices into the detections' `class_names`; negative for what is not evaluated."""
+    """(N,) indices into the detections' `class_names`; negative for objects that are not evaluated."""
     levels: NDArray[np.int64]
     """(N,) 1 or 2, or 0 for an object without points: see `difficulty_levels`."""
 
@@ -101,12 +101,12 @@ class WaymoScore:
 
 
 def difficulty_levels(points: NDArray[np.integer]) -> NDArray[np.int64]:
-    """Levels of objects from their number of LiDAR points: (N,) -> (N,) 0 without points, else 1 or 2."""
+    """Return the levels of objects from their number of LiDAR points: (N,) -> (N,) 0 without points, else 1 or 2."""
     return np.where(points > 0, np.where(points <= LEVEL_2_POINTS, 2, 1), 0)
 
 
 def min_iou(class_name: str) -> float:
-    """The least 3D IoU of a match: 0.7 for vehicles, 0.5 for every other class."""
+    """Return the least 3D IoU of a match: 0.7 for vehicles, 0.5 for every other class."""
     return VEHICLE_MIN_IOU if class_name.casefold() in VEHICLES else SMALL_MIN_IOU
 
 
@@ -117,14 +117,14 @@ def waymo_detection(
     no_label: Sequence[NDArray[np.bool_]] | None = None,
     reporter: Reporter = SILENT,
 ) -> list[WaymoScore]:
-    """AP and APH for every class of the detections, level and range, in that order.
+    """Compute AP and APH for every class of the detections, level and range, in that order.
 
     Args:
         truth: labels of each frame.
-        detections: of the same frames, in the same order and frame of reference, scores within [0, 1]. A frame in
-            which nothing was found has an empty one.
-        no_label: (D,) of each frame, which detections lie in a no-label zone. None without such zones.
-        reporter: of the progress.
+        detections: detections of the same frames, in the same order and coordinates, scores within [0, 1]. A frame
+            without detections has an empty one.
+        no_label: (D,) of each frame, whether a detection is in a no-label zone. None without such zones.
+        reporter: for the progress.
 
     Raises:
         ValueError: the sequences are empty or of different length, frames have different class names, or a score
@@ -152,7 +152,7 @@ def waymo_detection(
 def mean_over_classes(
     scores: Sequence[WaymoScore], level: int, range_m: tuple[float, float] = EVERYWHERE
 ) -> tuple[float, float]:
-    """mAP and mAPH in percent over the classes that have objects at that level and range; NaN if none has."""
+    """Compute mAP and mAPH in percent over the classes with objects at that level and range; NaN if none has."""
     rows = [(item.ap, item.aph) for item in scores if (item.level, item.range_m) == (level, range_m)]
     known = np.array([row for row in rows if None not in row], dtype=np.float64).reshape(-1, 2)
     ap, aph = known.mean(axis=0) if len(known) else (np.nan, np.nan)
@@ -216,14 +216,14 @@ class _Tally:
 
     def __init__(self) -> None:
         self.objects = np.zeros(len(LEVELS), dtype=np.int64)  # up to each level
-        # At each cutoff: true and false positives, finds, their heading accuracies, objects missed at each level.
+        # At each cutoff: true and false positives, heading accuracies, and objects missed at each level.
         self.detections = np.zeros(len(SCORE_CUTOFFS))
         self.finds = np.zeros(len(SCORE_CUTOFFS))
         self.heading_accuracy = np.zeros(len(SCORE_CUTOFFS))
         self.missed = np.zeros((len(LEVELS), len(SCORE_CUTOFFS)))
 
     def add(self, frame: _Frame) -> None:
-        reached = np.searchsorted(-frame.scores, -SCORE_CUTOFFS, side="right")  # how many have score >= cutoff
+        reached = np.searchsorted(-frame.scores, -SCORE_CUTOFFS, side="right")  # detections with score >= cutoff
         holders = best_assignments(frame.iou)
         held = holders != UNMATCHED
         accuracy = np.zeros(held.shape)
@@ -252,13 +252,13 @@ class _Tally:
 
 
 def _average_precision(recall: _Doubles, precision: _Doubles) -> float:
-    """Area under precision over recall, fractions (K,), in any order."""
+    """Compute the area under precision over recall, fractions (K,), in any order."""
     levels, group = np.unique(recall[recall > 0], return_inverse=True)
     best = np.zeros(len(levels))
     np.maximum.at(best, group, precision[recall > 0])
     best = np.maximum.accumulate(best[::-1])[::-1]
     area = lower = 0.0
-    # Down to recall 0, where precision is not known, the curve goes on level.
+    # Down to recall 0, where precision is undefined, the curve is constant.
     at_lower = best[0] if len(best) else 0.0
     for upper, at_upper in zip(levels, best, strict=True):
         gap = upper - lower
@@ -283,7 +283,7 @@ _LEVEL_2 = 2
 
 
 class WaymoFrames(NamedTuple):
-    """The arguments of `waymo_detection`: labels, detections and no-label zones of the same frames."""
+    """Arguments of `waymo_detection`: labels, detections and no-label zones of the same frames."""
 
     truth: list[WaymoTruth]
     detections: list[Detections]
@@ -291,10 +291,10 @@ class WaymoFrames(NamedTuple):
 
 
 def evaluated_classes(frames: ScoredFrames) -> tuple[str, ...]:
-    """KITTI's classes that occur, then the other ones that detections name or that KITTI does not know."""
+    """Return KITTI's classes that occur, then other classes of the detections or labels."""
     labelled = {name.casefold(): name for frame in frames.truth for name in frame.types}
     detected = {name.casefold(): name for frame in frames.detections for name in frame.types}
-    named = detected | labelled  # the spelling of the labels wins
+    named = detected | labelled  # the spelling of the labels has priority
     official = [name for name in CLASS_NAMES if name.casefold() in named]
     others = [key for key in named if key in detected or key not in FOLDED_KITTI_TYPES]
     folded = {name.casefold() for name in (*CLASS_NAMES, "DontCare")}
@@ -304,13 +304,13 @@ def evaluated_classes(frames: ScoredFrames) -> tuple[str, ...]:
 def waymo_frames(
     frames: ScoredFrames, class_names: Sequence[str], split: KittiSplit | None, *, reporter: Reporter = SILENT
 ) -> WaymoFrames:
-    """Labels and detections of KITTI text in one upright frame, with levels and no-label zones.
+    """Convert labels and detections of KITTI text to one upright frame, with levels and no-label zones.
 
     Args:
         frames: labels and predictions.
-        class_names: what is evaluated.
-        split: where the scans and calibrations are; None if there are none.
-        reporter: of the progress.
+        class_names: evaluated classes.
+        split: dataset of the scans and calibrations; None without any.
+        reporter: for the progress.
 
     Raises:
         DatasetError, ScanError: a score outside [0, 1]; a scan or calibration that cannot be read.
@@ -326,7 +326,7 @@ def waymo_frames(
 
 
 def upright_boxes(objects: FrameObjects) -> NDArray[np.float64]:
-    """(N, 7) x, y, z of the center, length, width, height, yaw; metres and radians, x forward, y left, z up."""
+    """Return (N, 7) x, y, z of the center, length, width, height, yaw; m and rad, x forward, y left, z up."""
     height, width, length = objects.dimensions_hwl.T
     right, down, forward = objects.locations.T
     yaw = wrap_angle(-objects.rotation_y - np.pi / 2)
@@ -347,7 +347,7 @@ def _truth(objects: FrameObjects, class_names: Sequence[str], split: KittiSplit 
 def _detections(
     truth: FrameObjects, found: FrameObjects, class_names: tuple[str, ...]
 ) -> tuple[Detections, NDArray[np.bool_]]:
-    """Those of the classes, D of them, and which (D,) lie in what stands for a no-label zone."""
+    """Return the D detections of the classes, and the mask (D,) of those in a substitute of a no-label zone."""
     labels = _labels(found, class_names)
     known = labels >= 0
     wrong = found.scores[known & ((found.scores < 0) | (found.scores > 1))]
@@ -366,7 +366,7 @@ def _detections(
 
 
 def _labels(objects: FrameObjects, class_names: Sequence[str]) -> NDArray[np.int64]:
-    """(N,) index of each object's class; -1 for another type, and for an object without a 3D box."""
+    """Return the index (N,) of each object's class; -1 for other types and for objects without a 3D box."""
     index = {name.casefold(): label for label, name in enumerate(class_names)}
     labels = np.array([index.get(name, -1) for name in objects.folded_types.tolist()], dtype=np.int64)
     return np.where(objects.dimensions_hwl.min(axis=1, initial=np.inf) > 0, labels, -1)
@@ -377,22 +377,22 @@ class WaymoReport:
     """Result of an evaluation by Waymo's metric, with all its numbers."""
 
     subject: str
-    """The model or folder and the data, in words."""
+    """Description of the model or folder and the data."""
     frames: ScoredFrames
     scores: Sequence[WaymoScore]
     has_points: bool
-    """True if the levels come from scans."""
+    """Whether the levels come from scans."""
     about: dict[str, Any]
     """Model, command, machine and versions, for the JSON."""
 
     @property
     def title(self) -> str:
-        """The subject, and how many frames stand behind the numbers."""
+        """Subject and number of frames."""
         return self.frames.titled(self.subject)
 
 
 def waymo_table(report: WaymoReport) -> TextTable:
-    """A row for every class and range, and the means over the classes; two columns for each level."""
+    """Return a table with a row for every class and range, and the class means; two columns for each level."""
     rows = []
     for name in dict.fromkeys(score.class_name for score in report.scores):
         for span in RANGES_M:
@@ -409,14 +409,14 @@ def waymo_table(report: WaymoReport) -> TextTable:
 
 
 def waymo_notes(report: WaymoReport) -> list[str]:
-    """Notes for the reader of the table."""
+    """Return notes on the table."""
     if report.has_points:
         return []
     return ["LEVEL_1 is not evaluated: levels come from the LiDAR points in the boxes; give --data ROOT with the scans"]
 
 
 def waymo_json(report: WaymoReport) -> dict[str, Any]:
-    """Everything in the report: a record for every class, level and range, and the means; percent."""
+    """Return the whole report: a record for every class, level and range, and the means; percent."""
     return {
         "protocol": "waymo",
         "subject": report.subject,
@@ -447,7 +447,7 @@ def _mean_json(report: WaymoReport, level: int, span: tuple[float, float]) -> di
 
 
 def _range_json(span: tuple[float, float]) -> dict[str, float | None]:
-    """JSON knows no infinity: a range without an end has null there."""
+    """Return a range for JSON, which has no infinity: a range without an end has None there."""
     low_m, high_m = span
     return {"low_m": low_m, "high_m": high_m if isfinite(high_m) else None}
 

@@ -1,1 +1,1 @@
-"""Geometry that training and the vehicle must compute identically: NumPy, and numba for the loops of NMS."""
+"""Geometry computed identically in training and on the vehicle: NumPy, and numba for the loops of NMS."""

@@ -1,4 +1,4 @@
-"""Short names of array types; shapes stand in the docstrings."""
+"""Aliases of NumPy array types; shapes are given in the docstrings."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""The box convention, and operations on single boxes: corners, points inside, residuals.
+"""Box convention, and operations on single boxes: corners, points inside, residuals.
 
 Frame: LiDAR, metres. x forward, y left, z up; yaw counter-clockwise about +z from +x, in [-pi, pi).
 
@@ -24,13 +24,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 DIRECTION_OFFSET_RAD = math.pi / 4
-"""Yaw at which direction bin 0 begins by default: it holds the yaws in [pi/4, 5pi/4), bin 1 the others.
+"""Yaw at which direction bin 0 begins by default: it contains yaws in [pi/4, 5pi/4), bin 1 the others.
 
-Most boxes stand near an anchor's yaw, and bins are hard to tell near their borders: no border lies on an anchor's yaw.
+Most boxes have a yaw near an anchor's, and bins are ambiguous near their borders: no border is at an anchor's yaw.
 """
 
-# Nothing is a hundred times as long as its anchor, but exp() of an untrained or overflowing network's output
-# can be infinite, and an infinite box makes NaN of every overlap it takes part in.
+# No object is a hundred times as long as its anchor, but exp() of an untrained or overflowing network's output
+# can be infinite, and an infinite box makes every overlap with it NaN.
 _MAX_LOG_RATIO = math.log(100.0)
 
 # Signs of the length and the width of the corners 0..3.
@@ -39,9 +39,9 @@ _WIDTH_SIGNS = np.array([0.5, 0.5, -0.5, -0.5])
 
 
 def wrap_angle(angle_rad: ArrayLike, period: float = 2 * math.pi) -> NDArray[Any]:
-    """Angles (...,) moved by whole periods into [-period / 2, period / 2); those already there come back unchanged.
+    """Return angles (...,) wrapped into [-period / 2, period / 2); those already inside are unchanged.
 
-    float32 in, float32 out; any other type comes out as float64. The interval holds for the rounded result
+    float32 in, float32 out; any other type is returned as float64. The interval holds for the rounded result
     too: the float32 nearest to pi is greater than pi and never returned.
     """
     angle = np.asarray(angle_rad)
@@ -61,9 +61,9 @@ def wrap_angle(angle_rad: ArrayLike, period: float = 2 * math.pi) -> NDArray[Any
 
 
 def footprints(boxes: NDArray[np.floating[Any]]) -> NDArray[np.floating[Any]]:
-    """Corners of the boxes seen from above: (N, 7) -> (N, 4, 2) x, y in metres, LiDAR frame.
+    """Return the BEV corners of the boxes: (N, 7) -> (N, 4, 2) x, y in metres, LiDAR frame.
 
-    Counter-clockwise, the front-left corner first (the drawing above). Keeps the floating type of `boxes`.
+    Counter-clockwise, the front-left corner first (see the drawing above). Keeps the floating type of `boxes`.
     """
     along = boxes[:, 3, None] * _LENGTH_SIGNS.astype(boxes.dtype)
     across = boxes[:, 4, None] * _WIDTH_SIGNS.astype(boxes.dtype)
@@ -74,7 +74,7 @@ def footprints(boxes: NDArray[np.floating[Any]]) -> NDArray[np.floating[Any]]:
 
 
 def corners(boxes: NDArray[np.floating[Any]]) -> NDArray[np.floating[Any]]:
-    """All corners: (N, 7) -> (N, 8, 3) metres, LiDAR frame; bottom four as in `footprints`, then top four."""
+    """Return all corners: (N, 7) -> (N, 8, 3) metres, LiDAR frame; bottom four as in `footprints`, then top four."""
     flat = footprints(boxes)
     half_height = boxes[:, 5] / 2
     z = np.stack([boxes[:, 2] - half_height, boxes[:, 2] + half_height], axis=1)
@@ -84,11 +84,11 @@ def corners(boxes: NDArray[np.floating[Any]]) -> NDArray[np.floating[Any]]:
 def points_in_boxes(
     points: NDArray[np.floating[Any]], boxes: NDArray[np.floating[Any]], margin_m: float = 0.0
 ) -> NDArray[np.bool_]:
-    """Mask of the points in each box, faces included: (P, >=3), (N, 7) -> (P, N) bool.
+    """Return the mask of the points in each box, faces included: (P, >=3), (N, 7) -> (P, N) bool.
 
     Args:
         points: columns x, y, z in metres, LiDAR frame; non-finite ones are in no box.
-        margin_m: by how much each face of the boxes is moved outwards.
+        margin_m: distance by which each face of the boxes is moved outwards.
     """
     inside = np.zeros((len(boxes), len(points)), bool)
     xyz = np.ascontiguousarray(points[:, :3].T)
@@ -132,15 +132,15 @@ def encode_boxes(
         ],
         axis=-1,
     ).astype(np.float32)
-    # From the rounded residual, as the decoder will see it: a yaw within rounding of a bin's border must not
-    # come back turned round.
+    # From the rounded residual, as the decoder reads it: a yaw within rounding of a bin's border must not be decoded as
+    # its opposite.
     return residuals, direction_bins(residuals[..., 6].astype(np.float64) + anchor[..., 6], direction_offset_rad)
 
 
 def direction_bins(
     yaw_rad: NDArray[np.floating[Any]], direction_offset_rad: float = DIRECTION_OFFSET_RAD
 ) -> NDArray[np.int64]:
-    """Bin 0 or 1 of each yaw: (...,) -> (...,); the two directions of a heading are in different bins."""
+    """Return bin 0 or 1 of each yaw: (...,) -> (...,); the two directions of a heading are in different bins."""
     return (np.mod(yaw_rad - direction_offset_rad, 2 * math.pi) >= math.pi).astype(np.int64)
 
 
@@ -150,9 +150,9 @@ def decode_boxes(
     anchors: NDArray[np.floating[Any]],
     direction_offset_rad: float = DIRECTION_OFFSET_RAD,
 ) -> NDArray[np.float32]:
-    """Inverse of `encode_boxes`: residuals (..., 7), direction (...,), anchors (..., 7) -> boxes (..., 7).
+    """Decode residuals, the inverse of `encode_boxes`: (..., 7), direction (...,), anchors (..., 7) -> boxes (..., 7).
 
-    The direction bin alone decides between a yaw and its opposite. Size ratios are held within 1/100 and 100.
+    The direction bin alone decides between a yaw and its opposite. Size ratios are clipped to 1/100 and 100.
     """
     residual, anchor = residuals.astype(np.float64), anchors.astype(np.float64)
     diagonal = np.hypot(anchor[..., 3], anchor[..., 4])[..., None]

@@ -1,4 +1,4 @@
-"""RANSAC for the plane that most points lie on: a wall, cars and leaves among them do not move it."""
+"""RANSAC plane fit, robust to walls, cars and leaves among the points."""
 
 import math
 from typing import Any
@@ -15,17 +15,17 @@ _MIN_SPREAD = 1e-9  # of points across a line through them, relative, squared
 def most_common_plane(
     points: NDArray[np.float64], band_m: float, max_slope: float = math.inf
 ) -> NDArray[np.float64] | None:
-    """The plane (3,) a, b, c of z = a x + b y + c that most of points (N, 3) lie within `band_m` of; metres.
+    """Fit the plane (3,) a, b, c of z = a x + b y + c with the most of points (N, 3) within `band_m` of it; metres.
 
-    The draws are seeded: the same points give the same plane.
+    The samples are seeded: the same points give the same plane.
 
     Args:
         points: any frame.
-        band_m: half the thickness of what counts as the plane.
-        max_slope: a drawn plane that is steeper along x or y is none.
+        band_m: inlier distance along z.
+        max_slope: sampled planes that are steeper along x or y are rejected.
 
     Returns:
-        None where no draw is a plane that may be, or the points that lie on one are in a line.
+        None where no sampled plane is valid, or the inliers are collinear.
     """
     if not len(points):
         return None
@@ -46,13 +46,13 @@ def most_common_plane(
 
 
 def plane_heights(plane: NDArray[np.float64], xy_m: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
-    """z (...,) of a plane (3,) at (..., >=2), metres; no matrix product, see `rotations.transform_points`."""
+    """Return z (...,) of a plane (3,) at (..., >=2), metres; no matrix product, see `rotations.transform_points`."""
     a, b, c = plane.tolist()
     return np.asarray(a * xy_m[..., 0].astype(np.float64) + b * xy_m[..., 1].astype(np.float64) + c)
 
 
 def _through_triples(triples: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The planes (M, 3) through three points each, (n, 3, 3), of those that span some area seen from above."""
+    """Return the planes (M, 3) through the triples (n, 3, 3) whose triangle is large enough in bird's-eye view."""
     (x, y, z), u, v = triples[:, 0].T, (triples[:, 1] - triples[:, 0]).T, (triples[:, 2] - triples[:, 0]).T
     area = u[0] * v[1] - u[1] * v[0]  # twice the triangle's
     regular = np.abs(area) > _MIN_AREA_M2
@@ -65,7 +65,7 @@ def _through_triples(triples: NDArray[np.float64]) -> NDArray[np.float64]:
 def _least_squares(
     x: NDArray[np.float64], y: NDArray[np.float64], z: NDArray[np.float64]
 ) -> NDArray[np.float64] | None:
-    """The plane (3,) with the least squares of distances along z from points, (n,) each; None if they are in a line."""
+    """Fit the plane (3,) with least squared distances along z to points, (n,) each; None if they are collinear."""
     if len(x) < 3:
         return None
     middle = x.mean(), y.mean(), z.mean()

@@ -1,7 +1,7 @@
-"""The loop of `rotated_nms`, compiled; tests/ops/numpy_kernels.py has it in NumPy.
+"""Loop of `rotated_nms`, compiled; tests/ops/numpy_kernels.py has the NumPy version.
 
-Here the cosine of the turn between two boxes is a sum of products of theirs, so overlaps differ in their last digits:
-the same boxes stay unless an overlap is within 1e-12 or so of the threshold.
+The cosine of the angle between two boxes is computed from their own sines and cosines, so overlaps differ in their
+last digits: the same boxes are kept unless an overlap is within 1e-12 or so of the threshold.
 """
 
 import math
@@ -14,7 +14,7 @@ from asca_pillars.geometry.arrays import Floats, Ints
 
 
 def nms(boxes: Floats, iou_threshold: float, limit: int) -> Ints:
-    """`numpy_kernels._nms`, box by box: boxes (N, 7), best first -> indices (K,) of those kept."""
+    """Suppress boxes one by one, as `numpy_kernels._nms`: boxes (N, 7), best first -> indices (K,) of those kept."""
     kept = np.empty(len(boxes), np.int64)
     count = _nms(boxes, iou_threshold, limit, np.empty((len(boxes), 3)), np.empty((len(boxes), 5)), kept)
     return kept[:count]
@@ -33,7 +33,7 @@ def _share(part: float, whole: float) -> float:
 
 @inner
 def _shared_area(x: float, y: float, cos: float, sin: float, al: float, aw: float, bl: float, bw: float) -> float:
-    """`paired_bev_intersection` for a of half extents al, aw, seen from b of half extents bl, bw."""
+    """Return `paired_bev_intersection` of a with half extents al, aw in the frame of b with half extents bl, bw."""
     cos_abs, sin_abs = abs(cos), abs(sin)
     if (
         abs(x) >= bl + cos_abs * al + sin_abs * aw
@@ -67,7 +67,10 @@ def _shared_area(x: float, y: float, cos: float, sin: float, al: float, aw: floa
     *(written(types.float64, 2), written(types.float64, 2), written(types.int64)),
 )
 def _nms(boxes: Floats, iou_threshold: float, limit: int, circles: Floats, shapes: Floats, kept: Ints) -> int:
-    """`circles`: x, y and radius of the kept boxes; `shapes`: half length, half width, area, cosine and sine."""
+    """Write the indices of kept boxes and return their number.
+
+    `circles` holds x, y and radius of the kept boxes; `shapes` half length, half width, area, cosine and sine.
+    """
     count = 0
     for i in range(len(boxes)):
         if count == limit:

@@ -9,7 +9,7 @@ from asca_pillars.geometry.arrays import Floats
 
 
 def of_quaternions(quaternions: NDArray[Any]) -> Floats:
-    """(..., 3, 3) of (..., 4) w, x, y, z, of any length; not numbers where that is 0 or not finite."""
+    """Return rotation matrices (..., 3, 3) of quaternions (..., 4) w, x, y, z; NaN if the norm is 0 or not finite."""
     with np.errstate(over="ignore"):
         lengths = np.linalg.norm(np.asarray(quaternions, np.float64), axis=-1, keepdims=True)
     w, x, y, z = np.moveaxis(quaternions / np.where((lengths > 0) & (lengths < np.inf), lengths, np.nan), -1, 0)
@@ -23,7 +23,7 @@ def of_quaternions(quaternions: NDArray[Any]) -> Floats:
 
 
 def of_roll_pitch_yaw(angles_rad: NDArray[Any]) -> Floats:
-    """(..., 3, 3) of (..., 3): about x by roll, then about y by pitch, then about z by yaw."""
+    """Return rotation matrices (..., 3, 3) of (..., 3): about x by roll, then y by pitch, then z by yaw."""
     angles = np.moveaxis(np.asarray(angles_rad, np.float64), -1, 0)
     (sr, sp, sy), (cr, cp, cy) = np.sin(angles), np.cos(angles)
     return _matrices(
@@ -38,23 +38,23 @@ def of_roll_pitch_yaw(angles_rad: NDArray[Any]) -> Floats:
 def transform_points(
     points: NDArray[Any], matrix: NDArray[Any], shift: NDArray[Any] | None = None, *, out: NDArray[Any] | None = None
 ) -> NDArray[Any]:
-    """Points (N, K) -> (N, J): matrix p + shift, see `transform_columns`.
+    """Transform points (N, K) -> (N, J): matrix p + shift, see `transform_columns`.
 
     Args:
         points: (N, K), metres, K at least 1.
         matrix: (J, K).
-        shift: (J,), metres, added after that; None: nothing.
-        out: (N, J) that is written and returned; it may be `points` itself. None: a new array.
+        shift: (J,), metres, added afterwards; None: no shift.
+        out: (N, J) array to write and return; may be `points` itself. None: a new array.
     """
     columns = transform_columns(np.ascontiguousarray(points.T), matrix, shift)
     transformed = np.empty(columns.shape[::-1], columns.dtype) if out is None else out
-    for place, column in enumerate(columns):  # all at once takes several times as long
+    for place, column in enumerate(columns):  # one assignment of all columns takes several times as long
         transformed[:, place] = column
     return transformed
 
 
 def transform_columns(columns: NDArray[Any], matrix: NDArray[Any], shift: NDArray[Any] | None = None) -> NDArray[Any]:
-    """Points as columns (K, N), metres -> (J, N): matrix p + shift, in the columns' own floating-point type.
+    """Transform points as columns (K, N), metres -> (J, N): matrix p + shift, in the columns' floating-point type.
 
     A matrix product of many points would wake the threads of NumPy's BLAS, which then spin for tens of milliseconds on
     the cores that the network needs.

@@ -1,1 +1,1 @@
-"""Scan files of every format, read as points (N, 4)."""
+"""Readers of scan files and recordings of all formats, as points (N, 4)."""

@@ -1,4 +1,4 @@
-"""Points from NumPy arrays: of `.npy` files, and of callers."""
+"""Points from NumPy arrays, of `.npy` files and of callers."""
 
 import warnings
 from pathlib import Path
@@ -14,32 +14,31 @@ _MANY_COLUMNS = 8
 
 
 def read_npy(path: Path) -> StoredPoints:
-    """The points of a NumPy array (N, 3 or more) of real numbers.
+    """Read the points of a NumPy array (N, 3 or more) of real numbers.
 
     Raises:
-        ScanError: no such array, or one that lies on its side.
+        ScanError: not such an array, or a transposed one.
     """
-    # Mapped, not loaded: mapping compares the header with the file's size before memory is taken, and
-    # refuses pickled objects.
+    # Memory-mapped, not loaded: the header is compared with the file's size before memory is allocated, and
+    # pickled objects are refused.
     try:
         with warnings.catch_warnings():
-            # NumPy reads the header as Python source, and Python would print warnings about it.
+            # NumPy parses the header as Python source, for which Python may print warnings.
             warnings.simplefilter("error", SyntaxWarning)
             warnings.simplefilter("error", DeprecationWarning)
             array = np.lib.format.open_memmap(path, mode="r")
     except OSError:
         raise
-    except Exception as error:  # NumPy lets the tokenizer's errors pass
+    except Exception as error:  # NumPy does not catch the tokenizer's errors
         reason = " ".join(str(error).split())[:100]
         raise ScanError(f"{path}: not an array of numbers ({reason}); {AGAIN}") from error
     return points_from_array(array, str(path))
 
 
 def points_from_array(array: NDArray[Any], source: str = "points") -> StoredPoints:
-    """The points of an array (N, >=3): x, y, z, and reflectance if there is a fourth column.
+    """Convert an array (N, >=3) to points: x, y, z, and reflectance if there is a fourth column.
 
-    The points of a masked array are those of which neither coordinate nor reflectance is masked; remarks count the
-    others.
+    Points of a masked array with a masked coordinate or reflectance are left out; remarks give their number.
 
     Raises:
         ScanError: another shape, too many points, or not real numbers.

@@ -1,11 +1,11 @@
-"""Statistics of the training scans: kept in the bundle, compared with by `input_check`."""
+"""Statistics of the training scans, stored in the bundle for `input_check`."""
 
 from dataclasses import dataclass
 
 from asca_pillars.base.errors import ConfigError
 from asca_pillars.base.strict import Strict
 
-_HIGHEST_M = 100.0  # ground below or above a sensor; farther, it is no measurement
+_HIGHEST_M = 100.0  # larger heights of the ground are not plausible
 
 
 @dataclass(frozen=True)
@@ -17,8 +17,8 @@ class ExpectedInput(Strict):
     reflectance_mean: tuple[float, float]
     """Mean reflectance of a scan, 0..1."""
     ground_z_m: tuple[float, float] | None
-    """Height of the ground near the sensor, LiDAR frame, metres (minus the sensor's height); None where no scan
-    showed it."""
+    """Height of the ground near the sensor, LiDAR frame, metres (minus the sensor's height); None if no scan
+    showed the ground."""
     camera_view: bool
     """Whether the scans were cropped to the points in the camera's image."""
 

@@ -11,14 +11,14 @@ from asca_pillars.base.installation import install_command
 from asca_pillars.scans.records import StoredPoints
 
 _FEW_ROWS = 2**23
-"""Rows that a file may have however small it is; a column of equal numbers is compressed to nearly nothing."""
+"""Rows that a file of any size may have; a column of equal numbers is compressed to nearly nothing."""
 
 
 def read_feather(path: Path) -> StoredPoints:
-    """The points of a sweep, intensity as it is stored.
+    """Read the points of a sweep, with the stored intensity.
 
     Raises:
-        ScanError: no feather file, or one without these columns.
+        ScanError: not a feather file, or one without these columns.
         AscaError: pyarrow is not installed.
     """
     table = feather_table(path, ("x", "y", "z", "intensity"), (), ScanError)
@@ -29,13 +29,13 @@ def read_feather(path: Path) -> StoredPoints:
 def feather_table(
     path: Path, numbers: tuple[str, ...], texts: tuple[str, ...], error: type[AscaError]
 ) -> dict[str, Any]:
-    """Columns of numbers and columns of texts of a feather file, each an array (N,).
+    """Read columns of numbers and of texts of a feather file, each as an array (N,).
 
-    Where nothing stands, a whole number is -1, another number NaN and a text None.
+    Missing values are -1 in columns of integers, NaN in those of other numbers and None in those of texts.
 
     Raises:
         AscaError: pyarrow is not installed.
-        error: no feather file, or a column is missing or of another kind.
+        error: not a feather file, or a column is missing or of another type.
     """
     try:
         import pyarrow
@@ -62,7 +62,7 @@ def feather_table(
             column = table[name]
             column = compute.fill_null(column, -1) if pyarrow.types.is_signed_integer(column.type) else column
             arrays[name] = column.to_numpy()
-        except (pyarrow.ArrowException, KeyError, ValueError):  # a name that stands there twice, text that is none
+        except (pyarrow.ArrowException, KeyError, ValueError):  # a duplicate name, or a column that is not text
             arrays[name] = np.zeros(0, bool)
         of_texts = arrays[name].dtype.kind == "O" and all(isinstance(value, str | None) for value in arrays[name])
         if not (of_texts if name in texts else arrays[name].dtype.kind in "iuf"):

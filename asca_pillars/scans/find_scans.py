@@ -1,4 +1,4 @@
-"""Search for scan files, and the names under which the results of each are written."""
+"""Search for scan files, and unique names for their results."""
 
 import hashlib
 import os
@@ -16,24 +16,24 @@ from asca_pillars.base.input_files import require_content
 SCAN_SUFFIXES = (".bin", ".npy", ".pcd", ".ply", ".feather")
 PREPARED_FILE = "README.txt"
 PREPARED_NOTE = "Computed from the dataset by `asca prepare` or by a training run. Delete it when no run uses it.\n"
-"""Text of the file that marks a folder computed from a dataset: it holds no scans."""
+"""Text of the file that marks a folder computed from a dataset, which contains no scans."""
 
 _LONGEST_NAME_BYTES = 240
-"""Names of files have at most 255 bytes, and results append such as `_image.png` to the name of their scan."""
+"""File names have at most 255 bytes, and results append suffixes such as `_image.png` to the name of their scan."""
 
 
 class NamedScan(NamedTuple):
-    """A scan file, and a relative path without a suffix that no other scan of the same run has."""
+    """Scan file, and a relative path without a suffix that is unique among the scans of a run."""
 
     path: Path
     name: Path
 
 
 def find_scans(path: str | Path) -> list[Path]:
-    """The scan at `path`, or those in the folder at `path`, to any depth, in natural order (2.bin before 10.bin).
+    """Return the scan at `path`, or all scans below the folder at `path`, in natural order (2.bin before 10.bin).
 
-    Hidden files and folders are left out, and what `asca prepare` computed; links to folders are followed. What has the
-    name of a scan and is no regular file, or a link to nothing, is refused when it is read.
+    Hidden files and folders and the output of `asca prepare` are left out; links to folders are followed. Entries with
+    the name of a scan that are no regular files, and broken links, are refused when they are read.
 
     Raises:
         ScanError: there is no scan.
@@ -51,7 +51,7 @@ def find_scans(path: str | Path) -> list[Path]:
 
 
 def files_below(folder: Path) -> Iterator[Path]:
-    """Every file below a folder, to any depth; links to folders are followed.
+    """Yield every file below a folder; links to folders are followed.
 
     Each folder is visited once, under the path without a link on it if there is one. Folders that may not be read are
     left out, and those that `asca prepare` wrote.
@@ -75,7 +75,7 @@ def files_below(folder: Path) -> Iterator[Path]:
 
 
 def _folder_identity(folder: Path) -> tuple[int, int]:
-    """The device and number of a folder, the same on all paths to it; resolving a deep path takes milliseconds."""
+    """Return the device and inode of a folder, equal on all paths to it; resolving a path takes milliseconds."""
     status = folder.stat()
     return status.st_dev, status.st_ino
 
@@ -83,12 +83,12 @@ def _folder_identity(folder: Path) -> tuple[int, int]:
 def _is_folder(entry: os.DirEntry[str]) -> bool:
     try:
         return entry.is_dir()
-    except OSError:  # links that lead to each other
+    except OSError:  # circular links
         return False
 
 
 def visible_files(folder: Path, pattern: str) -> list[Path]:
-    """The files in a folder whose names match, sorted; hidden ones are other programs', or left by a killed writer."""
+    """Return the visible files of a folder whose names match, sorted; hidden ones are temporary or of others."""
     return sorted(path for path in folder.glob(pattern) if not is_hidden(Path(path.name)))
 
 
@@ -102,7 +102,7 @@ def _is_prepared(folder: Path) -> bool:
 
 
 def name_scans(paths: Sequence[str | Path]) -> list[NamedScan]:
-    """All scans at several paths, each once, with names for their results.
+    """Return all scans at several paths, each once, with names for their results.
 
     A name is the scan's path below the folder that was given, without its suffix. Scans that would share a name are put
     below the name of the folder that was given (a/1.bin and b/1.bin), or keep their suffix (1.bin and 1.npy). Of a name
@@ -111,7 +111,7 @@ def name_scans(paths: Sequence[str | Path]) -> list[NamedScan]:
     Raises:
         ScanError: a path without scans, or two scans whose results would have the same name even then.
     """
-    origins: dict[tuple[tuple[int, int], str], tuple[Path, Path]] = {}  # (its folder, name) -> (scan, what was given)
+    origins: dict[tuple[tuple[int, int], str], tuple[Path, Path]] = {}  # (its folder, name) -> (scan, given path)
     folder_identity, resolved = cache(_folder_identity), cache(Path.resolve)
     for given in map(Path, paths):
         for scan in find_scans(given):
@@ -133,13 +133,13 @@ def name_scans(paths: Sequence[str | Path]) -> list[NamedScan]:
 
 
 def _where_shared(names: Sequence[Path], others: Sequence[Path]) -> list[Path]:
-    """`names`, and in the place of each one that occurs twice its `others`."""
+    """Return `names`, with each one that occurs twice replaced by its entry in `others`."""
     counts = Counter(names)
     return [other if counts[name] > 1 else name for name, other in zip(names, others, strict=True)]
 
 
 def _shortened(name: Path) -> Path:
-    """The name itself, or if its last part is too long the start of that and eight digits of its SHA-256."""
+    """Return the name, or if its last part is too long its start and eight digits of its SHA-256."""
     encoded = os.fsencode(name.name)
     if len(encoded) <= _LONGEST_NAME_BYTES:
         return name
@@ -148,14 +148,14 @@ def _shortened(name: Path) -> Path:
 
 
 def is_scan(relative: Path) -> bool:
-    """Whether it is a scan by its name; `relative` to the folder that is searched."""
+    """Return whether a file is a scan by its name; `relative` to the folder that is searched."""
     if relative.suffix.lower() == ".feather" and not relative.stem.isdecimal():
         return False  # Argoverse 2 names sweeps by their time; its labels and poses are feather files too
     return relative.suffix.lower() in SCAN_SUFFIXES and not is_hidden(relative)
 
 
 def natural_order(path: Path) -> list[list[tuple[int, str]]]:
-    """A key by which 2.bin comes before 10.bin."""
+    """Return a sort key by which 2.bin precedes 10.bin."""
     return [_pieces(part) for part in path.parts]
 
 

@@ -11,13 +11,13 @@ from asca_pillars.base.errors import ScanError
 from asca_pillars.geometry.common_plane import most_common_plane, plane_heights
 from asca_pillars.scans.mounting import Mounting
 
-NEAR_M = (3.0, 20.0)  # beyond the vehicle itself, before the beams become sparse
+NEAR_M = (3.0, 20.0)  # beyond the vehicle itself, up to where the beams become sparse
 CELL_M = 1.0
 BAND_M = 0.12
-"""Half the thickness of what counts as the plane: camber and kerbs within it."""
+"""Inlier distance of the plane, which allows for camber and kerbs."""
 MIN_CELLS = 40
 MIN_SHARE = 0.3
-"""Smallest share of the cells whose low point lies on the plane."""
+"""Smallest fraction of the cells whose low point is on the plane."""
 MAX_SHARE_BELOW = 0.3
 MAX_TILT_DEG = 5.0
 MAX_SPREAD_M = 0.3
@@ -25,23 +25,23 @@ _BY_HAND = "give the height in metres (--sensor-height 1.8, or sensor_height_m o
 
 
 class GroundPlane(NamedTuple):
-    """The ground near one sensor, level frame."""
+    """Ground plane near one sensor, level frame."""
 
     height_m: float
     """Height of the origin above the plane."""
     tilt_deg: float
-    """Angle between the normal and z."""
+    """Angle between the normal and z, degrees."""
     share: float
-    """Share of the cells of 1 m whose low point lies within BAND_M of the plane."""
+    """Fraction of the cells of 1 m whose low point is within BAND_M of the plane."""
     share_below: float
-    """Share of the cells whose low point lies further below it: a plane above others is no ground."""
+    """Fraction of the cells whose low point is further below it: a plane above others is not the ground."""
     cells: int
     normal: tuple[float, float, float]
     """Unit normal, upwards."""
 
     @property
     def doubt(self) -> str | None:
-        """Why this may not be the ground; None if it is."""
+        """Reason why this may not be the ground; None if it is."""
         if self.share < MIN_SHARE or self.share_below > MAX_SHARE_BELOW:
             return f"only {self.share:.0%} of the low points lie on a plane, {self.share_below:.0%} below it"
         if self.tilt_deg > MAX_TILT_DEG:
@@ -57,17 +57,17 @@ class NamedPoints(NamedTuple):
 
 
 class HeightEstimate(NamedTuple):
-    """The sensor's height over several scans."""
+    """Height of the sensor, estimated from several scans."""
 
     height_m: float
     """Median over the scans."""
     spread_m: float
-    """Difference of the highest and the lowest scan."""
+    """Difference between the highest and the lowest estimate."""
     share: float
     """Smallest `GroundPlane.share`."""
     scans: int
     left_out: tuple[str, ...] = ()
-    """Scans that show no clear ground, each with the reason."""
+    """Scans without a clear ground, each with the reason."""
 
     def __str__(self) -> str:
         agree = "" if self.scans == 1 else f", which agree within {self.spread_m:.2f} m"
@@ -94,7 +94,7 @@ def estimate_height(scans: Iterable[NDArray[Any]], mounting: Mounting | None = N
 def estimate_named_height(
     scans: Iterable[NamedPoints], mounting: Mounting | None = None, enough: int | None = None
 ) -> HeightEstimate:
-    """As `estimate_height`, of scans with names, of which those after `enough` that show the ground are not read.
+    """Estimate the height as `estimate_height`, from named scans, until `enough` of them show the ground.
 
     Raises:
         ScanError: no scan shows a clear ground, or the scans contradict each other; names one.
@@ -132,16 +132,16 @@ def _first_of(left_out: Sequence[str]) -> str:
 def measured_mounting(
     scans: Iterable[NDArray[Any]], mounting: Mounting | None = None
 ) -> tuple[Mounting, HeightEstimate]:
-    """The mounting with the height in metres that its scans (N, >=3) show, see `estimate_height`."""
+    """Return the mounting with the height in metres estimated from its scans (N, >=3), see `estimate_height`."""
     estimate = estimate_height(scans, mounting)
     return replace(mounting or Mounting(), sensor_height_m=estimate.height_m), estimate
 
 
 def fit_ground_plane(points: NDArray[Any]) -> GroundPlane | None:
-    """The plane through most low points near the sensor: (N, >=3) level frame, metres; None: too few, or on a line.
+    """Fit the ground plane near the sensor: (N, >=3) level frame, metres; None: too few low points, or collinear ones.
 
     One low point per square metre counts, so that the dense rings near the sensor do not outvote the rest. The
-    draws are seeded: the same points give the same plane.
+    samples are seeded: the same points give the same plane.
     """
     low = _low_points(points)
     if len(low) < MIN_CELLS:
@@ -156,7 +156,7 @@ def fit_ground_plane(points: NDArray[Any]) -> GroundPlane | None:
 
 
 def _low_points(points: NDArray[Any]) -> NDArray[np.float64]:
-    """Points (C, 3), one per square metre near the sensor: the one at the tenth percentile of z."""
+    """Return one point (C, 3) per square metre near the sensor: the one at the tenth percentile of z."""
     xyz = points[:, :3].astype(np.float64)
     squared = np.square(xyz[:, :2]).sum(axis=1)
     ring = xyz[(squared > NEAR_M[0] ** 2) & (squared < NEAR_M[1] ** 2)]

@@ -1,6 +1,6 @@
-"""Compares a scan with those of the training and checks its axes; each difference comes with the option that mends it.
+"""Comparison of a scan with the training scans, and a check of its axes; each warning names the option to set.
 
-A wrong reflectance scale, sensor height or axis ruins detection without any error; here it becomes a sentence.
+A wrong reflectance scale, sensor height or axis degrades detection without an error; here it gives a warning.
 """
 
 from typing import NamedTuple
@@ -15,22 +15,22 @@ from asca_pillars.scans.mounting import Mounting
 
 OUTSIDE_SHARE = 0.95
 FAR_M, FAR_SHARE = 1000.0, 0.05
-"""A distance, metres, and the share of a LiDAR's points that may lie further away."""
+"""Distance in metres, and the largest fraction of a LiDAR's points that may be further away."""
 BEHIND_SHARE = 0.2
-"""Smallest share of points behind, beyond BODY_M: a revolution has about half, a view of 200 degrees a tenth."""
+"""Smallest fraction of points behind, beyond BODY_M: about 0.5 in a revolution, 0.1 in a field of view of 200 deg."""
 BODY_M = 3.0
-"""Nearer returns are mostly those of the vehicle itself."""
-SAMPLE_POINTS = 8_192  # as good as all of them for a mean and a percentile, at a tenth of a millisecond
-_FRAME_STEP = 2  # of the sample; angles and ranges take longer
+"""Nearer returns are mostly of the vehicle itself."""
+SAMPLE_POINTS = 8_192  # enough for a mean and a percentile, in a tenth of a millisecond
+_FRAME_STEP = 2  # of the sample; angles and ranges are slower to compute
 
 TOLERANCE_M = 0.5
-"""A ground further than this from where a detector expects it is another sensor height, not another road."""
+"""A ground that differs by more from the expected height means another sensor height, not another road."""
 
 _SCALES = (100.0, 255.0, 65535.0)
 
 
 class InputWarning(NamedTuple):
-    """One way in which a scan is far from the training scans; `about` names the way, `text` is for people."""
+    """Difference between a scan and the training scans; `about` is its kind, `text` the message for users."""
 
     about: str
     text: str
@@ -50,23 +50,23 @@ def check_input(
         counts: points inside and outside the detector's grid.
         expected: statistics of the training scans.
         mounting: the mounting by which the points came into that frame.
-        looks_in: the detector's ranges; None: it looks in every direction.
+        looks_in: the detector's ranges; None: every direction.
     """
     mounting = mounting or Mounting()
     fewest, most = expected.points_per_scan
     if len(points) < fewest / 10:
         text = f"{len(points)} points, the training scans had {fewest} to {most}"
-        return [InputWarning("points", text)]  # too few to say anything else
-    # Column by column in memory, which is how it is read: NumPy is slow along rows of four.
+        return [InputWarning("points", text)]  # too few for the other checks
+    # Contiguous columns, as they are read: NumPy is slow along rows of four.
     sample = np.ascontiguousarray(points[:: max(1, len(points) // SAMPLE_POINTS)].T).T
     if far := _far_warning(sample):
-        return [far]  # the other checks would only repeat it
+        return [far]  # the other checks would repeat it
     ground = ground_z_m(sample)
     axes = check_axes(sample[::_FRAME_STEP], ground)
     warnings = [_reflectance_warning(sample[:, 3], expected)]
     if axes is not None:
         warnings.append(InputWarning(axes.about, f"{axes.text}: {_axes_remedy(axes.axes, mounting)}"))
-    if axes is None or axes.about not in ("upside down", "tilt"):  # then the height means nothing
+    if axes is None or axes.about not in ("upside down", "tilt"):  # otherwise the height is meaningless
         warnings.append(_height_warning(ground, expected, mounting))
     if counts.points_outside > OUTSIDE_SHARE * counts.points and axes is None:
         share = 100 * counts.points_outside / counts.points
@@ -81,7 +81,7 @@ def check_input(
 
 
 def _far_warning(sample: Singles) -> InputWarning | None:
-    """Points that no LiDAR sees: their unit is not metres, or they lie in a map's frame."""
+    """Return a warning if the unit is not metres, or the points are in a map's frame."""
     sideways = sample[:, :2]
     share = np.count_nonzero((np.abs(sideways) > FAR_M).any(axis=1)) / len(sample)
     if share <= FAR_SHARE:
@@ -129,7 +129,7 @@ def _height_warning(ground: float | None, expected: ExpectedInput, mounting: Mou
     lifted_m = 0.0
     if mounting.sensor_height_m is not None and expected.sensor_height_m is not None:
         lifted_m = mounting.sensor_height_m - expected.sensor_height_m
-    height_m = lifted_m - ground + 0.0  # no -0
+    height_m = lifted_m - ground + 0.0  # avoids -0
     text = (
         f"the ground near the sensor lies at z = {ground:.2f} m, in training at {low:.2f} to {high:.2f} m: "
         f"state the height above the ground (--sensor-height {height_m:.2f} or auto)"
@@ -155,15 +155,15 @@ def _axes_remedy(axes: str | None, mounting: Mounting) -> str:
 
 
 _AXES = ("x,y,z", "y,-x,z", "-x,-y,z", "-y,x,z")
-"""Axes (forward, left, up) of a scan whose forward direction is that of the quadrant, see `Mounting.axes`."""
+"""Axes (forward, left, up) of a scan for each quadrant that its forward direction may be in, see `Mounting.axes`."""
 
 _EDGE_PERCENTILES = (5, 20, 80, 95)
 _SHARP_M = 0.5
-"""Largest distance between the outer two percentiles at the ground, which ends sharply; walls and trees do not."""
+"""Largest distance between the outer two percentiles at the ground, a sharp edge; walls and trees have none."""
 _GROUND_ABOVE_M = 1.0
 
 _SECTOR_LENGTH = 0.6
-"""Mean of the unit vectors towards the points: 0 for a whole revolution, 0.92 for a camera's view."""
+"""Length of the mean unit vector towards the points: 0 for a whole revolution, 0.92 for a camera's field of view."""
 _MAX_OFF_AHEAD_DEG = 45.0
 
 _REACH_M = (3.0, 60.0)
@@ -171,19 +171,19 @@ _GROUND_BAND_M = 0.75
 _HALF_WIDTH_DEG = 25.0
 _MIN_POINTS = 20
 _MIN_ALONG = 0.85
-"""Least ratio of the median ground range ahead and behind to that at the sides: one sees further along a street.
-None of 200 simulated whole revolutions falls below; turned by a quarter, 90 % of them do."""
+"""Least ratio of the median ground range ahead and behind to that at the sides: streets are visible further along.
+No simulated revolution of 200 is below it; turned by a quarter, 90 % of them are."""
 
 _MAX_TILT_DEG = 6.0
 _RING_M = (4.0, 20.0)
-"""Beyond the vehicle's own roof, before the beams become sparse."""
+"""Beyond the vehicle's own roof, up to where the beams become sparse."""
 _LOW_PERCENTILE = 10.0
-"""Below it lie ditches and reflections."""
+"""Lower points are ditches and reflections."""
 _MIN_GROUND_POINTS = 50
 
 
 class AxesWarning(NamedTuple):
-    """A sign that the axes are wrong: `about` names the kind, `axes` those that would mend it, if any would."""
+    """Sign of wrong axes: `about` is its kind, `axes` those that would correct it, or None."""
 
     about: str
     text: str
@@ -191,12 +191,12 @@ class AxesWarning(NamedTuple):
 
 
 def ground_z_m(points: Singles) -> float | None:
-    """Height of the ground around the sensor, metres: a low percentile of z in a near ring of the points.
+    """Return the height of the ground around the sensor, metres: a low percentile of z in a near ring of points.
 
-    Takes finite points (N, >=3) in the LiDAR frame; None if the ring holds too few of them to tell.
+    Takes finite points (N, >=3) in the LiDAR frame; None if the ring has too few of them.
     """
     x, y = points[:, 0], points[:, 1]
-    with np.errstate(over="ignore"):  # infinitely far is not near
+    with np.errstate(over="ignore"):  # infinite distances are not near
         squared_range = x * x + y * y
     ring = np.flatnonzero((squared_range > _RING_M[0] ** 2) & (squared_range < _RING_M[1] ** 2))
     ring_z = points[:, 2].take(ring)
@@ -210,10 +210,10 @@ def check_axes(points: Singles, ground_z_m: float | None) -> AxesWarning | None:
 
     Args:
         points: (N, >=3) finite x, y, z in metres, in what should be the LiDAR frame; some thousands are enough.
-        ground_z_m: height of the ground near the sensor, if it is seen.
+        ground_z_m: height of the ground near the sensor, if it is visible.
     """
     x, y, z = points[:, :3].T
-    with np.errstate(over="ignore"):  # infinitely far is not near
+    with np.errstate(over="ignore"):  # infinite distances are not near
         radius = np.hypot(x, y)
     ring = (radius > _RING_M[0]) & (radius < _RING_M[1])
     if warning := _upside_down(z[ring]):
@@ -229,7 +229,7 @@ def check_axes(points: Singles, ground_z_m: float | None) -> AxesWarning | None:
 
 
 def _upside_down(z: Floating) -> AxesWarning | None:
-    """The points end sharply above the sensor, as they do at the ground, and gradually below it."""
+    """Return a warning if the points end sharply above the sensor, as at the ground, and gradually below it."""
     if len(z) < _MIN_POINTS:
         return None
     ordered = np.sort(z)
@@ -241,7 +241,7 @@ def _upside_down(z: Floating) -> AxesWarning | None:
 
 
 def _sector(x: Floating, y: Floating, radius: Floating) -> AxesWarning | None:
-    """The points fill a sector that is not ahead."""
+    """Return a warning if the points fill a sector that is not ahead."""
     away = radius > 0
     if not away.any():
         return None
@@ -255,14 +255,14 @@ def _sector(x: Floating, y: Floating, radius: Floating) -> AxesWarning | None:
 
 
 def _mean_direction(x: Floating, y: Floating) -> tuple[float, float]:
-    """Mean of the unit vectors towards points, (N,) each, none of them at the origin."""
-    with np.errstate(over="ignore"):  # infinitely far has no direction
+    """Return the mean unit vector towards points, (N,) each, none of them at the origin."""
+    with np.errstate(over="ignore"):  # infinite points have no direction
         radius = np.hypot(x, y)
     return float((x / radius).mean()), float((y / radius).mean())
 
 
 def _across(radius: Floating, quadrants: list[Mask]) -> AxesWarning | None:
-    """The ground is seen further to the sides than ahead and behind."""
+    """Return a warning if the ground is visible further to the sides than ahead and behind."""
     reach = []
     for quadrant in quadrants:
         if np.count_nonzero(quadrant) < _MIN_POINTS:
@@ -276,7 +276,7 @@ def _across(radius: Floating, quadrants: list[Mask]) -> AxesWarning | None:
 
 
 def _tilted(z: Floating, radius: Floating, quadrants: list[Mask]) -> AxesWarning | None:
-    """The ground falls from one side to the other by more than streets do."""
+    """Return a warning if the ground is steeper from one side to the other than streets are."""
     low = []
     for quadrant in quadrants:
         if np.count_nonzero(quadrant) < _MIN_POINTS:
@@ -291,14 +291,14 @@ def _tilted(z: Floating, radius: Floating, quadrants: list[Mask]) -> AxesWarning
 
 
 def _quadrants(x: Floating, y: Floating, half_width_deg: float) -> list[Mask]:
-    """Masks of the points within so many degrees, at most 45, of straight ahead, left, behind and right."""
+    """Return masks of the points within an angle, at most 45 degrees, of ahead, left, behind and right."""
     slope = float(np.tan(np.radians(half_width_deg)))
     along_x, along_y = np.abs(y) < slope * np.abs(x), np.abs(x) < slope * np.abs(y)
     return [along_x & (x > 0), along_y & (y > 0), along_x & (x < 0), along_y & (y < 0)]
 
 
 def _percentile(ordered: Floating, percent: float) -> float:
-    """`np.percentile` of ascending values (n,), n at least 1, which takes ten times as long for a thousand of them."""
+    """Return `np.percentile` of ascending values (n,), n at least 1; ten times as fast for a thousand of them."""
     place, part = divmod(percent / 100 * (len(ordered) - 1), 1)
     low, high = float(ordered[int(place)]), float(ordered[min(int(place) + 1, len(ordered) - 1)])
     return low + part * (high - low)

@@ -1,4 +1,4 @@
-"""Measures the scans of a training, once, for the bundle."""
+"""Statistics of training scans for the bundle."""
 
 from collections.abc import Iterable
 

@@ -1,4 +1,4 @@
-"""Place and axes of a sensor, so that a model sees its scans as it saw those of its training."""
+"""Pose and axes of a sensor, by which scans are transformed to the model's frame."""
 
 import math
 import re
@@ -19,7 +19,7 @@ from asca_pillars.geometry.frame_change import FrameChange, is_rigid
 Row: TypeAlias = tuple[float, float, float, float]
 
 MIN_UPRIGHT = math.cos(math.radians(45))
-"""A scan whose z axis leans further than this has no boxes that turn about z."""
+"""Boxes rotate about z alone; a scan whose z axis is tilted further cannot have such boxes."""
 
 MAX_HEIGHT_M = 10.0
 _NAMED_AXES = {"x-forward": "x,y,z", "y-forward": "y,-x,z"}
@@ -30,18 +30,18 @@ _EXAMPLES = (
 
 @dataclass(frozen=True)
 class Mounting(Strict):
-    """Pose of a scan's frame in the model's: x forward, y left, z up, level, so high above the ground.
+    """Pose of a scan's frame in the model's: x forward, y left, z up, level, at a height above the ground.
 
     Attributes:
         sensor_height_m: height above the ground of the frame's origin, after `axes` or `pose`: the sensor's for scans
-            in its own frame, 0 where z = 0 is the ground. None: as high as that of the training.
-        axes: where forward, left and up are found in the scan. `x-forward` is x,y,z; `y-forward` is y,-x,z (x to the
+            in its own frame, 0 where z = 0 is the ground. None: the height of the training scans.
+        axes: axes of the scan that are forward, left and up. `x-forward` is x,y,z; `y-forward` is y,-x,z (x to the
             right, as on nuScenes' cars); z down is x,-y,-z. Mirrored frames such as x,-y,z are mirrored back.
-        pose: 4x4 matrix from the scan to a level frame, x forward, y left, z up, metres; then `axes` stays as it is.
+        pose: 4x4 matrix from the scan to a level frame, x forward, y left, z up, metres; then `axes` keeps its default.
 
     Raises:
-        ConfigError: no such height or axes, a pose that is not a rotation and a shift, or an up axis that is not the
-            scan's z or -z.
+        ConfigError: invalid height or axes, a pose that is not a rotation and a translation, or an up axis that is not
+            the scan's z or -z.
     """
 
     sensor_height_m: float | None = None
@@ -52,7 +52,7 @@ class Mounting(Strict):
         height = self.sensor_height_m
         if not isinstance(height, Real | None):
             raise ConfigError(f"sensor height {height!r:.40}: give metres; `measured_mounting(scans)` estimates them")
-        if height is not None and not abs(float(height)) <= MAX_HEIGHT_M:  # NaN too
+        if height is not None and not abs(float(height)) <= MAX_HEIGHT_M:  # also refuses NaN
             raise ConfigError(f"sensor height {height:g}: give metres above the ground, at most {MAX_HEIGHT_M:g}")
         if self.pose is not None:
             object.__setattr__(self, "pose", _rows(self.pose))
@@ -64,7 +64,7 @@ class Mounting(Strict):
 
     @cached_property
     def level(self) -> FrameChange:
-        """Change from the scan to x forward, y left, z up about the same origin, or that of the pose."""
+        """Transform from the scan to x forward, y left, z up about the same origin, or that of the pose."""
         if self.pose is None:
             return FrameChange(_signed_axes(self.axes), np.zeros(3))
         refuse_axes_with_pose(self.axes)
@@ -74,7 +74,7 @@ class Mounting(Strict):
         return FrameChange(pose[:3, :3], pose[:3, 3])
 
     def to_model(self, trained_height_m: float | None) -> FrameChange:
-        """Change from the scan to the model's frame.
+        """Return the transform from the scan to the model's frame.
 
         Args:
             trained_height_m: height of the sensor in the scans that the model was trained on; None: unknown.
@@ -86,16 +86,16 @@ class Mounting(Strict):
 
 
 def refuse_axes_with_pose(axes: str) -> None:
-    """Raise ConfigError if axes are stated beside a pose."""
+    """Raise ConfigError if both axes and a pose are stated."""
     if axes != "x-forward":
         raise ConfigError(f"axes {axes} and a pose: the pose turns the axes already; give one of them")
 
 
 def read_pose(path: str | Path) -> tuple[Row, Row, Row, Row]:
-    """A 4x4 matrix from a text file of 16 numbers, row by row.
+    """Read a 4x4 matrix from a text file of 16 numbers, row by row.
 
     Raises:
-        ConfigError: the file cannot be read or holds something else.
+        ConfigError: the file cannot be read or has other content.
     """
     try:
         text = read_text(path, ConfigError)
@@ -111,7 +111,7 @@ def read_pose(path: str | Path) -> tuple[Row, Row, Row, Row]:
 
 
 def _rows(pose: object) -> tuple[Row, Row, Row, Row]:
-    """A pose as plain numbers, which compare and hash; ConfigError if it is no 4x4 matrix."""
+    """Convert a pose to plain numbers, which compare and hash; ConfigError if it is not a 4x4 matrix."""
     try:
         matrix = np.asarray(pose, np.float64)
     except (TypeError, ValueError):
@@ -123,7 +123,7 @@ def _rows(pose: object) -> tuple[Row, Row, Row, Row]:
 
 
 def _signed_axes(text: str) -> NDArray[np.float64]:
-    """(3, 3) rows forward, left, up in the scan's frame."""
+    """Return (3, 3) rows forward, left, up in the scan's frame."""
     if not isinstance(text, str):
         raise ConfigError(f"axes {text!r:.40}: give {_EXAMPLES}")
     names = [name.strip().lstrip("+") for name in _NAMED_AXES.get(text, text).split(",")]

@@ -18,7 +18,7 @@ from asca_pillars.scans.records import (
 )
 
 _KEYS = ("VERSION", "FIELDS", "SIZE", "TYPE", "COUNT", "WIDTH", "HEIGHT", "VIEWPOINT", "POINTS", "DATA")
-_OLD_KEYS = {"COLUMNS": "FIELDS"}  # as PCD's first version has it
+_OLD_KEYS = {"COLUMNS": "FIELDS"}  # in PCD's first version
 _PAGE_BYTES = tuple(2**power for power in range(12, 17))  # of memory: 4 KiB on most machines, up to 64 KiB on others
 _TYPES = {
     f"{kind}{size}": f"<{kind.lower()}{size}" for kind in "IUF" for size in (1, 2, 4, 8) if kind + str(size) != "F1"
@@ -26,10 +26,10 @@ _TYPES = {
 
 
 def read_pcd(path: Path) -> StoredPoints:
-    """The points of a PCD file in its own frame: VIEWPOINT is where the sensor stood, and is not applied.
+    """Read the points of a PCD file in its own frame: VIEWPOINT, the sensor's pose, is not applied.
 
-    Bytes after the points are left out, with a remark, where they are padding: all zeros, or as many as PCL up to 1.8
-    appends, which makes a file as large as a page of memory and the points together.
+    Bytes after the points are ignored, with a remark, where they are padding: all zeros, or as many as PCL up to 1.8
+    appends, for a file size of the points plus a page of memory.
 
     Raises:
         ScanError: the header is not PCD's, contradicts itself, lacks x, y or z, or the body is damaged or not of
@@ -68,7 +68,7 @@ def lzf_decompress(data: bytes, size: int) -> bytearray:
 
     A control byte below 32 precedes that many literals plus one. Any other starts a reference: three bits of
     length (7: one more byte follows to be added) plus two, and thirteen bits of distance minus one, counted
-    back from the end of what is written. A reference may overlap its own output.
+    back from the end of the output. A reference may overlap its own output.
 
     Raises:
         ValueError: the stream ends within a token, refers to before its start, or has another size. It is followed
@@ -105,7 +105,7 @@ def lzf_decompress(data: bytes, size: int) -> bytearray:
 
 
 def _decompress(path: Path, body: bytes, needed: int) -> tuple[bytearray, int]:
-    """The unpacked points, and the length of what they were unpacked from."""
+    """Decompress the points; also return the number of bytes read."""
     if len(body) < 8:
         raise ScanError(f"{path}: the compressed body is missing; {AGAIN}")
     packed_size, size = struct.unpack_from("<2I", body)
@@ -159,7 +159,7 @@ def _fields(path: Path, header: dict[str, list[str]]) -> list[Field]:
 
 
 def _point_count(path: Path, header: dict[str, list[str]]) -> int:
-    """POINTS, which has to be WIDTH times HEIGHT where those are there too."""
+    """Return POINTS, which must be WIDTH times HEIGHT where those are given too."""
     numbers = {}
     for key in ("POINTS", "WIDTH", "HEIGHT"):
         words = header.get(key)

@@ -17,7 +17,7 @@ from asca_pillars.scans.records import (
     whole_number,
 )
 
-MAX_LISTS = 1_000_000  # of the elements before the vertices: each has to be walked over
+MAX_LISTS = 1_000_000  # of the elements before the vertices, which are skipped one by one
 _BYTE_ORDERS = {"ascii": "<", "binary_little_endian": "<", "binary_big_endian": ">"}
 _TYPES = {
     **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"},
@@ -28,7 +28,7 @@ _TYPES = {
 
 @dataclass
 class _Element:
-    """One element of the header; a list property has the type of its length beside that of its items."""
+    """Element of the header; a list property has the type of its length and that of its items."""
 
     name: str
     count: int
@@ -40,10 +40,10 @@ class _Element:
 
 
 def read_ply(path: Path) -> StoredPoints:
-    """The vertices of a PLY file. In an ASCII one every entry of every element has a line.
+    """Read the vertices of a PLY file. In an ASCII file every entry of every element has a line.
 
     Raises:
-        ScanError: the header is not PLY's, there are no vertices with x, y and z, or the body is damaged.
+        ScanError: not a PLY header, no vertices with x, y and z, or the body is damaged.
     """
     encoding, elements, body = _split_header(path, path.read_bytes())
     names = [element.name for element in elements]
@@ -71,7 +71,7 @@ def read_ply(path: Path) -> StoredPoints:
 
 
 def _skip_bytes(path: Path, body: bytes, elements: list[_Element]) -> int:
-    """The number of bytes that `elements` take at the start of a binary body."""
+    """Return the number of bytes that `elements` take at the start of a binary body."""
     position = 0
     for element in elements:
         if not element.has_lists:

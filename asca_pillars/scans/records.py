@@ -1,4 +1,4 @@
-"""Point records with named fields, which the PCD and PLY formats share once their headers are read."""
+"""Point records with named fields, shared by the PCD and PLY readers."""
 
 import re
 from collections.abc import Sequence
@@ -13,7 +13,7 @@ from asca_pillars.base.errors import ScanError
 AGAIN = "the file is damaged or incomplete: copy or export it again"
 MAX_HEADER_BYTES = 65_536
 MAX_POINTS = 50_000_000
-"""Points that a file may hold; ten times what the densest sensors give in a second."""
+"""Largest number of points in a file: ten times what the densest sensors measure in a second."""
 
 _REFLECTANCE = ("intensity", "reflectance", "reflectivity", "i")
 _DIGITS = re.compile(r"[0-9]{1,18}")
@@ -21,7 +21,7 @@ _DIGITS = re.compile(r"[0-9]{1,18}")
 
 @dataclass(frozen=True)
 class Field:
-    """A field of one point: `count` values of `dtype`, in the file's byte order and without padding."""
+    """Field of a point: `count` values of `dtype`, in the file's byte order and without padding."""
 
     name: str
     dtype: np.dtype[np.generic]
@@ -29,14 +29,14 @@ class Field:
 
     @property
     def size_bytes(self) -> int:
-        """Bytes of the whole field in one point."""
+        """Size of the whole field in one point, bytes."""
         return self.dtype.itemsize * self.count
 
 
 class StoredPoints(NamedTuple):
     """Points of a file: `xyz` (N, 3) float32 in m, `reflectance` (N,) of any scale, or None if there is none.
 
-    `dtype` is the type that the file declares for the reflectance, and `remarks` say what the reader had to decide.
+    `dtype` is the type that the file declares for the reflectance; `remarks` are the reader's decisions.
     """
 
     xyz: NDArray[np.float32]
@@ -46,12 +46,12 @@ class StoredPoints(NamedTuple):
 
 
 def whole_number(word: str) -> int | None:
-    """The number that a word writes in decimal digits; None if it is anything else, or absurdly long."""
+    """Parse a word of decimal digits; return None if it is anything else, or too long."""
     return int(word) if _DIGITS.fullmatch(word) else None
 
 
 def points_from_text(source: str, lines: Sequence[bytes], fields: Sequence[Field], count: int) -> StoredPoints:
-    """The `count` points of the lines of an ASCII body: one point a line, `fields` after `fields`.
+    """Parse `count` points of the lines of an ASCII body: one point per line, field by field.
 
     Raises:
         ScanError: lines are missing, not as long as the fields, or not of numbers; or there is no x, y and z.
@@ -60,11 +60,11 @@ def points_from_text(source: str, lines: Sequence[bytes], fields: Sequence[Field
     if len(lines) < count:
         raise ScanError(f"{source}: {len(lines)} lines where {count} points need {count}; {AGAIN}")
     rows = [line.split() for line in lines[:count]]
-    # Joined without a look at the lines, one value too few would shift all later ones into other columns.
+    # If the lines were joined unchecked, a missing value would shift all later ones into other columns.
     for number, row in enumerate(rows):
         if len(row) != width:
             raise ScanError(f"{source}: point {number} has {len(row)} values where the fields need {width}; {AGAIN}")
-    if any(b"_" in line for line in lines[:count]):  # Python takes 1_000 for a number
+    if any(b"_" in line for line in lines[:count]):  # Python parses 1_000 as a number
         raise ScanError(f"{source}: a point has a word with _ in it, no number; {AGAIN}")
     try:
         table = np.array(rows, dtype=np.float64).reshape(count, width)
@@ -79,7 +79,7 @@ def points_from_text(source: str, lines: Sequence[bytes], fields: Sequence[Field
 def points_from_bytes(
     source: str, data: bytes | bytearray, fields: Sequence[Field], count: int, *, by_field: bool = False
 ) -> StoredPoints:
-    """The `count` points of a binary body: point after point, or (`by_field`) field after field.
+    """Read `count` points of a binary body: point by point, or (`by_field`) field by field.
 
     Raises:
         ScanError: the body is shorter than `count` points, or the fields hold no x, y and z.
@@ -100,10 +100,10 @@ def points_from_bytes(
 
 
 def select_fields(source: str, fields: Sequence[Field]) -> list[int]:
-    """Indices of x, y, z and, where there is one, the reflectance. CloudCompare writes scalar_Intensity.
+    """Return the indices of x, y, z and, if present, the reflectance. CloudCompare writes scalar_Intensity.
 
     Raises:
-        ScanError: a coordinate is missing, or one of them is there twice or has several values per point.
+        ScanError: a coordinate is missing, or one of them occurs twice or has several values per point.
     """
     names = [field.name.lower().removeprefix("scalar_") for field in fields]
     if missing := [name for name in "xyz" if name not in names]:
@@ -121,7 +121,7 @@ def select_fields(source: str, fields: Sequence[Field]) -> list[int]:
 
 
 def assemble_points(count: int, columns: Sequence[NDArray[np.generic]], fields: Sequence[Field]) -> StoredPoints:
-    """Points of columns (N,) x, y, z in metres and perhaps reflectances, with the field of each."""
+    """Return points of columns (N,) x, y, z in metres and optional reflectances, with the field of each."""
     xyz = np.zeros((count, 3), dtype=np.float32)
     with np.errstate(over="ignore", invalid="ignore"):
         for axis, column in enumerate(columns[:3]):

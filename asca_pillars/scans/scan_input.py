@@ -1,4 +1,4 @@
-"""Scan files read as `ScanSettings` say, and the mounting of their sensor."""
+"""Reading of scan files by `ScanSettings`, with the mounting of their sensor."""
 
 from collections.abc import Sequence
 from itertools import groupby
@@ -10,14 +10,14 @@ from asca_pillars.scans.stored_scans import FolderScale, folder_reflectance_scal
 
 
 class ScanInput:
-    """Reads scans; the reflectance scale of each folder and suffix is decided once.
+    """Reader of scans; the reflectance scale of each folder and suffix is decided once.
 
     Attributes:
-        mounting: of the sensor.
-        said: sentences about what was decided, for the user.
+        mounting: mounting of the sensor.
+        said: sentences for the user about what was decided.
 
     Raises:
-        ConfigError, ScanError: an option cannot be used, or the height not be estimated.
+        ConfigError, ScanError: an option cannot be used, or the height cannot be estimated.
     """
 
     def __init__(self, settings: ScanSettings, paths: Sequence[Path]) -> None:
@@ -32,7 +32,7 @@ class ScanInput:
             self.said.append(f"sensor height: {estimate}")
 
     def read(self, path: Path) -> Scan:
-        """One of the scans.
+        """Read one of the scans.
 
         Raises:
             ScanError: as `read_scan`.
@@ -40,7 +40,7 @@ class ScanInput:
         return read_scan(path, columns=self._columns, reflectance_scale=self.scale(path))
 
     def scale(self, path: Path) -> ReflectanceScale:
-        """The reflectance scale of one of the scans."""
+        """Return the reflectance scale of one of the scans."""
         return self._scales[_folder_and_suffix(path)].scale
 
     def _decide(self, folder: Path, paths: list[Path]) -> FolderScale:
@@ -51,7 +51,7 @@ class ScanInput:
 
 
 def said_of_scale(decided: FolderScale) -> list[str]:
-    """What a user is to know of a scale that the values decided: a sentence, or none."""
+    """Return a sentence for the user about a scale that was decided by the values, or none."""
     if decided.scale in (1.0, "auto"):
         return []
     return [decided.doubt or f"reflectances were taken as 0..{decided.scale:g} (--reflectance-scale {decided.scale:g})"]

@@ -1,4 +1,4 @@
-"""Scan files of any common format to points (N, 4) float32: x, y, z in metres, reflectance in 0..1."""
+"""Reader of scan files of all formats: points (N, 4) float32, x, y, z in metres, reflectance in 0..1."""
 
 import math
 from collections.abc import Callable
@@ -20,7 +20,7 @@ from asca_pillars.scans.ply import read_ply
 from asca_pillars.scans.records import AGAIN, MAX_POINTS, StoredPoints
 
 ReflectanceScale = Literal["auto"] | float
-"""The stored value that is a reflectance of 1: 1, 100, 255, 65535, any other positive number, or auto."""
+"""Stored value that is a reflectance of 1: 1, 100, 255, 65535, any other positive number, or auto."""
 
 MAX_FILE_BYTES = 8 * 2**30
 MAX_COLUMNS = 16
@@ -29,7 +29,7 @@ _MAX_RING = 512
 _FEW = 100
 _FOUR, _FIVE = "x, y, z, reflectance", "x, y, z, reflectance, ring"
 
-# A few values above a scale are specks or retroreflectors; of a scale that is too small there are always more.
+# A few values above a scale are noise or retroreflectors; with a scale that is too small there are always more.
 _SHARE_ABOVE = 0.001
 _SLACK = 2.0  # a scan stored in 0..255 has many values above 2; values just above 1 are common
 
@@ -39,9 +39,9 @@ class ScanNotes:
     """Changes, dropped points and decisions of the reader.
 
     Attributes:
-        dropped_points: with a coordinate or reflectance that is not finite.
-        clipped_reflectances: outside 0..1 after scaling, and brought to the nearer end.
-        reflectance_scale: what stored reflectances were divided by; None if the file has none.
+        dropped_points: points with a coordinate or reflectance that is not finite.
+        clipped_reflectances: reflectances outside 0..1 after scaling, clipped.
+        reflectance_scale: divisor of the stored reflectances; None if the file has none.
         remarks: sentences for the user, such as that five columns were found.
     """
 
@@ -52,14 +52,14 @@ class ScanNotes:
 
 
 class Scan(NamedTuple):
-    """The finite points (N, 4) float32 of a file, x, y, z in m and reflectance 0..1, and what was done to get them."""
+    """Finite points (N, 4) float32 of a file, x, y, z in m and reflectance 0..1, with the reader's notes."""
 
     points: NDArray[np.float32]
     notes: ScanNotes
 
     @property
     def dropped_points(self) -> int:
-        """Points of the file that were not finite."""
+        """Number of the file's points that were not finite."""
         return self.notes.dropped_points
 
 
@@ -67,8 +67,8 @@ def read_scan(path: str | Path, *, columns: int | None = None, reflectance_scale
     """Read a scan by its suffix (`SCAN_SUFFIXES`).
 
     A file without reflectance gets zeros. Points with a coordinate or reflectance that is not finite are dropped and
-    counted. A well-formed file without points is an empty scan. Of each kind of file so much is read as its size
-    allows, at most MAX_POINTS points or MAX_FILE_BYTES.
+    counted. A well-formed file without points is an empty scan. At most MAX_POINTS points or MAX_FILE_BYTES are
+    read.
 
     Args:
         path: the file.
@@ -88,7 +88,7 @@ def write_scan(path: str | Path, points: NDArray[np.floating]) -> None:
     """Write points (N, 4), N > 0, as KITTI's `.bin`: little-endian float32 x, y, z, reflectance.
 
     Raises:
-        ScanError: there are no points (`.bin` has no header, so that an empty file cannot be told from a lost one), or
+        ScanError: there are no points (`.bin` has no header, so an empty file would look like a lost one), or
             the suffix is another.
     """
     if points.ndim != 2 or points.shape[1] != 4:
@@ -125,7 +125,7 @@ def read_stored(path: Path, columns: int | None) -> StoredPoints:
 
 
 def finite_scan(stored: StoredPoints, scale: ReflectanceScale) -> Scan:
-    """The finite points of what is stored, reflectances divided by `scale`, or by what the values suggest."""
+    """Return the finite stored points, reflectances divided by `scale`, or by the scale that the values suggest."""
     points = np.zeros((len(stored.xyz), 4), dtype=np.float32)
     points[:, :3] = stored.xyz
     notes = ScanNotes(remarks=stored.remarks)
@@ -135,18 +135,18 @@ def finite_scan(stored: StoredPoints, scale: ReflectanceScale) -> Scan:
         doubt = ambiguity(stored.reflectance, number) if by_values else None
         notes = ScanNotes(0, clipped, number, (*stored.remarks, *([doubt] if doubt else [])))
     finite, dropped = np.isfinite(points), 0
-    if not finite.all():  # row by row is ten times slower
+    if not finite.all():  # selecting rows is ten times slower
         kept = points[finite.all(axis=1)]
         points, dropped = kept, len(points) - len(kept)
     return Scan(points, replace(notes, dropped_points=dropped))
 
 
 def read_raw_floats(path: Path, columns: int | None = None) -> StoredPoints:
-    """The points of a file of little-endian float32: x, y, z, then (from four columns on) reflectance.
+    """Read the points of a file of little-endian float32: x, y, z, then (from four columns on) reflectance.
 
     Args:
         path: the file.
-        columns: values of a point, 3 to 16; None: four or five, whichever the values fit.
+        columns: values per point, 3 to 16; None: four or five, whichever fits the values.
 
     Raises:
         ScanError: no whole number of points, more than MAX_POINTS, or both four and five columns are plausible.
@@ -173,7 +173,7 @@ def read_raw_floats(path: Path, columns: int | None = None) -> StoredPoints:
 
 
 def _columns(path: Path, size: int, data: NDArray[np.float32]) -> int:
-    """Four, unless five fit better.
+    """Return the number of columns: four, unless five fit better.
 
     Five are plausible if the fifth counts rings (whole and small; all 0 where an exporter left them out). Of such a
     file read in fours, the reflectances are now and then heights or coordinates: negative, as no sensor's are.
@@ -183,7 +183,7 @@ def _columns(path: Path, size: int, data: NDArray[np.float32]) -> int:
         return 4
     varied = bool((rings != rings[0]).any())
     if not varied and len(rings) < _FEW:
-        return 4  # too few to tell from a file that is cut off
+        return 4  # too few to distinguish from a truncated file
     if size % 16 == 0 and _plausible(data.reshape(-1, 4)):
         if not varied:
             return 4
@@ -192,7 +192,7 @@ def _columns(path: Path, size: int, data: NDArray[np.float32]) -> int:
 
 
 def _plausible(table: NDArray[np.float32]) -> bool:
-    """Whether columns can be x, y, z and a reflectance: hardly any far away, hardly any negative reflectance."""
+    """Return whether columns can be x, y, z and reflectance: few distant points, few negative reflectances."""
     with np.errstate(invalid="ignore"):
         in_range = (np.abs(table[:, :3]) <= _FAR_M).all(axis=1)
         return bool(((table[:, 3] >= 0) & (table[:, 3] <= 65535) & in_range).mean() >= 0.99)
@@ -204,7 +204,7 @@ def _whole_and_small(values: NDArray[np.float32]) -> bool:
 
 
 def checked_scale(scale: ReflectanceScale) -> ReflectanceScale:
-    """The scale itself.
+    """Return the scale if it is valid.
 
     Raises:
         ScanError: it is neither auto nor a positive number.
@@ -221,7 +221,7 @@ def checked_scale(scale: ReflectanceScale) -> ReflectanceScale:
 
 
 def unit_reflectance(values: NDArray[np.generic], scale: float) -> tuple[NDArray[np.float32], int]:
-    """Stored reflectances (N,) over `scale`, within 0..1, NaN where they were not finite; how many lay outside it."""
+    """Return reflectances (N,) divided by `scale`, clipped to 0..1, NaN if not finite; and how many were clipped."""
     with np.errstate(over="ignore", invalid="ignore"):
         reflectance = values.astype(np.float32)
         finite = np.isfinite(reflectance)
@@ -231,13 +231,13 @@ def unit_reflectance(values: NDArray[np.generic], scale: float) -> tuple[NDArray
 
 
 def decide_scale(values: NDArray[np.generic], dtype: np.dtype[np.generic] | None = None) -> tuple[float, bool]:
-    """The scale that reflectances (N,) are stored in: 1, 255 or 65535; and whether their values decided it.
+    """Return the scale of stored reflectances (N,): 1, 255 or 65535; and whether it was decided by their values.
 
     Bytes are 0..255. Other numbers are taken as 0..1 (integers: as 0..255) unless more than one in a thousand, and
-    more than a single one, are too large for it; so one speck does not darken a scan.
+    more than a single one, are too large for it, so that one outlier does not darken a scan.
 
     Args:
-        values: as stored.
+        values: stored values.
         dtype: the type that the file declares for them; None: that of `values`.
     """
     kind = values.dtype if dtype is None else dtype
@@ -251,7 +251,7 @@ def decide_scale(values: NDArray[np.generic], dtype: np.dtype[np.generic] | None
 
 
 def ambiguity(values: NDArray[np.generic], scale: float) -> str | None:
-    """A sentence if reflectances (N,) taken as 0..255 may as well be 0..100."""
+    """Return a sentence if reflectances (N,) taken as 0..255 may also be 0..100."""
     if scale != 255 or _many_above(values, 100):
         return None
     return (

@@ -1,4 +1,4 @@
-"""Reading of scan files and mounting of their sensor: the options of commands and the keys of a dataset.yaml, alike."""
+"""Settings of scan reading and sensor mounting, shared by the options of commands and the keys of a dataset.yaml."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -16,21 +16,21 @@ from asca_pillars.scans.mounting import Mounting, read_pose, refuse_axes_with_po
 from asca_pillars.scans.scan_reader import ReflectanceScale
 
 FEWEST_COLUMNS = 3
-SAMPLE_SCANS = 8  # that show the ground: a height of "auto" is their median
-SEARCHED_SCANS = 32  # that are looked at for them
+SAMPLE_SCANS = 8  # with visible ground: a height of "auto" is their median
+SEARCHED_SCANS = 32  # that are searched for them
 
 
 @dataclass(frozen=True)
 class ScanSettings(Strict):
-    """Facts that a scan file does not state itself.
+    """Properties that a scan file does not state itself.
 
     Attributes:
         sensor_height: metres above the ground of the scans' origin, after `axes` or `pose`; "auto": estimated from the
-            scans. None: as high as in the training.
+            scans. None: the height of the training scans.
         axes: as `Mounting.axes`.
         pose: file with a 4x4 matrix, instead of axes (`mounting.read_pose`).
-        reflectance_scale: the stored value that is a reflectance of 1; "auto": by the values.
-        columns: float32 values per point of a .bin; None: four or five, by the values.
+        reflectance_scale: the stored value that is a reflectance of 1; "auto": decided by the values.
+        columns: float32 values per point of a .bin; None: four or five, decided by the values.
 
     Raises:
         ConfigError: a value that cannot be used.
@@ -43,7 +43,7 @@ class ScanSettings(Strict):
     columns: int | None = None
 
     def __post_init__(self) -> None:
-        Mounting(self._stated_height_m, self.axes)  # refuses what it cannot use
+        Mounting(self._stated_height_m, self.axes)  # validates the values
         if self.pose is not None:
             refuse_axes_with_pose(self.axes)
         if self.columns is not None and self.columns < FEWEST_COLUMNS:
@@ -52,10 +52,10 @@ class ScanSettings(Strict):
             raise ConfigError(f"reflectance_scale {self.reflectance_scale:g}: must be positive, such as 255, or auto")
 
     def stated_mounting(self, folder: Path | None = None) -> Mounting:
-        """The mounting as far as it is stated: an "auto" height is left open.
+        """Return the mounting as far as it is stated: an "auto" height is None.
 
         Args:
-            folder: that a relative `pose` is looked for in; None: the working directory.
+            folder: base of a relative `pose`; None: the working directory.
 
         Raises:
             ConfigError: the pose cannot be read, or does not go with the axes.
@@ -66,10 +66,10 @@ class ScanSettings(Strict):
     def mounting(
         self, samples: Iterable[NamedPoints], folder: Path | None = None
     ) -> tuple[Mounting, HeightEstimate | None]:
-        """The mounting, and how a height of "auto" was estimated; None if it was stated.
+        """Return the mounting, and the estimate of a height of "auto"; None if it was stated.
 
         Args:
-            samples: some scans; only looked at where the height is "auto", and then until enough show the ground.
+            samples: some scans; only read if the height is "auto", until enough of them show the ground.
             folder: as for `stated_mounting`.
 
         Raises:
@@ -88,10 +88,10 @@ class ScanSettings(Strict):
 
 
 def sample_points(paths: Sequence[Path], read: Callable[[Path], NDArray[np.float32]]) -> Iterator[NamedPoints]:
-    """Up to SEARCHED_SCANS scans but those unreadable or empty: SAMPLE_SCANS evenly spaced ones, then those between.
+    """Yield up to SEARCHED_SCANS readable scans with points: SAMPLE_SCANS evenly spaced ones, then those between.
 
     Args:
-        paths: of all scans.
+        paths: paths of all scans.
         read: points (N, >=3), metres, of one of them; ScanError if it cannot be read.
     """
     step = max(-(-len(paths) // SAMPLE_SCANS), 1)
@@ -100,6 +100,6 @@ def sample_points(paths: Sequence[Path], read: Callable[[Path], NDArray[np.float
         try:
             points = read(path)
         except ScanError:
-            continue  # named when its turn comes
+            continue  # reported when it is read
         if len(points):
             yield NamedPoints(str(path), points)

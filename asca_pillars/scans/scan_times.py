@@ -1,4 +1,4 @@
-"""When the scans of a folder were taken: at a constant rate, or at the times that a file lists."""
+"""Time stamps of the scans of a folder: at a constant rate, or from a file."""
 
 from collections.abc import Sequence
 from decimal import Decimal, InvalidOperation
@@ -8,13 +8,13 @@ from asca_pillars.base.errors import ConfigError, ScanError
 from asca_pillars.base.input_files import read_text
 
 RATE_HZ = 10.0
-"""Rate of scans for which none is given."""
+"""Default rate of scans."""
 _MAX_RATE_HZ = 1000.0
-_MAX_TIME_S = 9_000_000_000  # in 2255; more would be no seconds
+_MAX_TIME_S = 9_000_000_000  # in 2255; larger numbers are not seconds
 
 
 def require_one_folder(paths: Sequence[Path]) -> None:
-    """Refuse scans of several folders, whose order in time nobody knows, with a ConfigError."""
+    """Refuse scans of several folders, whose order in time is unknown, with a ConfigError."""
     if len(folders := sorted({path.parent for path in paths})) > 1:
         raise ConfigError(
             f"{folders[0]} and {folders[1]}: with --track, --rate, --times, --foxglove or --rerun scans lie in one "
@@ -23,16 +23,16 @@ def require_one_folder(paths: Sequence[Path]) -> None:
 
 
 def scan_times_ns(count: int, rate_hz: float | None = None, times: Path | None = None) -> list[int]:
-    """The time of each of `count` scans, nanoseconds, ascending; with a rate, they begin at 0.
+    """Return the time of each of `count` scans, nanoseconds, ascending; with a rate, they begin at 0.
 
     Args:
-        count: of the scans.
+        count: number of scans.
         rate_hz: scans per second; None: RATE_HZ.
-        times: a text file with the seconds of each scan, one in a line.
+        times: text file with the seconds of each scan, one per line.
 
     Raises:
-        ConfigError: there is no such rate, or both are given.
-        ScanError: the file cannot be read, lists another number of times, or one that does not ascend.
+        ConfigError: the rate is invalid, or both are given.
+        ScanError: the file cannot be read, has another number of times, or they do not ascend.
     """
     if times is None:
         rate = RATE_HZ if rate_hz is None else rate_hz

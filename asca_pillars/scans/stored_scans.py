@@ -1,4 +1,4 @@
-"""Scans as they are stored: their numbers as they are, and one reflectance scale for those that belong together."""
+"""Scans with their stored values, and one reflectance scale for scans of the same source."""
 
 from collections.abc import Sequence
 from contextlib import suppress
@@ -14,16 +14,16 @@ from asca_pillars.scans.scan_reader import ReflectanceScale, ambiguity, decide_s
 
 
 class FolderScale(NamedTuple):
-    """Divisor of the reflectances of scans that belong together, and why it may be wrong, if it may."""
+    """Reflectance scale of scans of the same source, and the reason why it may be wrong, if any."""
 
     scale: ReflectanceScale
     doubt: str | None
 
 
 def folder_reflectance_scale(paths: Sequence[Path], *, columns: int | None = None, sample: int = 16) -> FolderScale:
-    """One reflectance scale for scans that belong together, from `sample` of them, evenly spaced.
+    """Return one reflectance scale for scans of the same source, from `sample` of them, evenly spaced.
 
-    A dark scan among brighter ones is then not read on another scale. Scans that cannot be read, or have no points,
+    A dark scan among brighter ones is then read on the same scale. Scans that cannot be read, or have no points,
     are ignored; where none has reflectances, the scale is auto.
     """
     chosen = paths if len(paths) <= sample else [paths[i * len(paths) // sample] for i in range(sample)]
@@ -35,7 +35,7 @@ def folder_reflectance_scale(paths: Sequence[Path], *, columns: int | None = Non
 
 
 def common_reflectance_scale(stored: Sequence[StoredPoints]) -> FolderScale:
-    """One reflectance scale for scans that belong together: the largest that any of them is stored in.
+    """Return one reflectance scale for scans of the same source: the largest scale of any of them.
 
     Auto where none of them has reflectances; scans without points are ignored.
     """
@@ -50,13 +50,13 @@ def common_reflectance_scale(stored: Sequence[StoredPoints]) -> FolderScale:
 
 
 def has_finite_point(stored: StoredPoints) -> bool:
-    """Whether there is a point whose numbers are all finite: drivers send scans of none while a sensor starts."""
+    """Return whether a point has only finite numbers: drivers send scans without any while a sensor starts."""
     finite = np.isfinite(stored.xyz).all(axis=1)
     return bool((finite if stored.reflectance is None else finite & np.isfinite(stored.reflectance)).any())
 
 
 def stored_points(path: Path, *, columns: int | None = 4) -> NDArray[np.float32]:
-    """The numbers of a scan as they are stored, (N, 4): of any reflectance scale, perhaps not finite.
+    """Read the stored values of a scan, (N, 4): of any reflectance scale, possibly not finite.
 
     Args:
         path: the file.

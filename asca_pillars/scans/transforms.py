@@ -1,4 +1,4 @@
-"""Transforms between the frames of a vehicle: ROS' tf, from live messages or from those of a recording."""
+"""Transforms between the frames of a vehicle: ROS' tf, from live messages or a recording."""
 
 from typing import Any
 
@@ -15,13 +15,13 @@ _STATIC = "tf_static"
 
 
 class Transforms:
-    """The latest transform of each frame into its parent."""
+    """Latest transform of each frame to its parent."""
 
     def __init__(self) -> None:
         self._parents: dict[str, tuple[str, NDArray[np.float64]]] = {}
 
     def add(self, message: Any) -> None:
-        """Take what a `tf2_msgs/TFMessage` says; transforms that are no rotation and shift are left out."""
+        """Store the transforms of a `tf2_msgs/TFMessage`, except those that are no rotation and translation."""
         for one in message.transforms:
             shift, turn = one.transform.translation, one.transform.rotation
             matrix = np.eye(4)
@@ -31,7 +31,7 @@ class Transforms:
                 self._parents[_plain(one.child_frame_id)] = _plain(one.header.frame_id), matrix
 
     def between(self, source: str, target: str) -> NDArray[np.float64] | None:
-        """(4, 4) matrix, metres, from one frame to another; None where nothing connects them."""
+        """Return the (4, 4) matrix, metres, from one frame to another; None if they are not connected."""
         from_source, from_target = self._upwards(_plain(source)), self._upwards(_plain(target))
         for frame, matrix in from_source.items():
             if frame in from_target:
@@ -40,16 +40,16 @@ class Transforms:
 
     @property
     def frames(self) -> list[str]:
-        """The names of all frames, sorted."""
+        """Names of all frames, sorted."""
         return sorted({*self._parents, *(parent for parent, _ in self._parents.values())})
 
     def _upwards(self, frame: str) -> dict[str, NDArray[np.float64]]:
-        """The matrix from the frame to itself, its parent, that one's parent and so on."""
+        """Return the matrices from the frame to itself, its parent and all further ancestors."""
         matrix = np.eye(4)
         found = {frame: matrix}
         while frame in self._parents:
             frame, step = self._parents[frame]
-            if frame in found:  # round in a circle
+            if frame in found:  # a cycle
                 break
             matrix = step @ matrix
             found[frame] = matrix
@@ -57,11 +57,11 @@ class Transforms:
 
 
 def read_static_transforms(recording: Recording, frame: str) -> Transforms:
-    """Read the transforms of a recording's `/tf_static`, of any namespace.
+    """Read the transforms of a recording's `/tf_static` in any namespace.
 
     Args:
         recording: to read from.
-        frame: that is asked for later.
+        frame: frame that is needed later.
 
     Raises:
         ScanError: there is no such topic, none of its messages can be read, or they do not name the frame.
@@ -79,7 +79,7 @@ def read_static_transforms(recording: Recording, frame: str) -> Transforms:
         for message in recording.messages(topic):
             try:
                 transforms.add(decoded(message, TRANSFORM_TYPES[0]))
-            except Exception as error:  # the library lets struct's errors pass
+            except Exception as error:  # the library does not catch struct's errors
                 trouble = f" ({reason(error)})"
     if _plain(frame) not in transforms.frames:
         known = ", ".join(transforms.frames)[:200] or f"no frame{trouble}"
@@ -88,5 +88,5 @@ def read_static_transforms(recording: Recording, frame: str) -> Transforms:
 
 
 def _plain(frame: str) -> str:
-    """The name of a frame; ROS 1 wrote some with a slash before them."""
+    """Return a frame's name without the leading slash of ROS 1."""
     return str(frame).lstrip("/")

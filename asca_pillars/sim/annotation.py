@@ -1,13 +1,13 @@
-"""KITTI labels of a simulated scan: what the camera sees, or everything around the sensor.
+"""KITTI labels of a simulated scan: of the camera's field of view, or of every direction.
 
-Labels all around (`label_all_around`) are KITTI's text with these meanings where there is no camera:
+Labels of every direction (`label_all_around`) are KITTI's text with these meanings where there is no camera:
 
     box 2D      -1 -1 -1 -1 for an object beside the image or behind the camera
-    truncated   -1 (unknown) for such an object: there is no image border that could cut it
-    occluded    0..3 by the share of the firings that reach the object, in whatever direction it stands
-    alpha       the heading against the line of sight, as for any object: it needs no image
+    truncated   -1 (unknown) for such an object: no image border truncates it
+    occluded    0..3 by the share of the firings that reach the object, in any direction
+    alpha       the heading relative to the line of sight, as for any object: it needs no image
 
-There are no DontCare areas: what hardly returns anything is occluded 3. simulation.json in the folder of the set says
+There are no DontCare areas: objects with hardly any returns are occluded 3. The set's simulation.json states
 "field_of_view": "around". KITTI's protocol ignores objects without a 2D box, for their lack of height in the image.
 """
 
@@ -21,13 +21,13 @@ from asca_pillars.sim.casting.raycast import Hits
 from asca_pillars.sim.scene_config import SceneConfig
 from asca_pillars.sim.world.placement import Target
 
-# Visible share of the firings that would meet the object alone, above which KITTI's annotators would say
+# Visible fraction of the firings that would hit the object alone, above which an object is
 # "fully visible" (0), "partly occluded" (1) and "largely occluded" (2); below the last it is "unknown" (3).
-# The steps give simulated cars the shares of KITTI's: 47, 28, 21 and 3 %.
+# With these steps simulated cars have the shares of KITTI's: 47, 28, 21 and 3 %.
 OCCLUSION_STEPS = (0.82, 0.36, 0.09)
 UNKNOWN = len(OCCLUSION_STEPS)
 MAX_TRUNCATION = 0.95
-UNKNOWN_FROM_TRUNCATION = 0.85  # what hardly stands in the image, KITTI mostly marks as unknown, too
+UNKNOWN_FROM_TRUNCATION = 0.85  # KITTI mostly marks objects largely outside the image as unknown, too
 
 Owners = npt.NDArray[np.int32]
 
@@ -35,17 +35,17 @@ Owners = npt.NDArray[np.int32]
 def label_camera_view(
     targets: tuple[Target, ...], hits: Hits, owner: Owners, calib: Calibration, config: SceneConfig
 ) -> list[KittiObject]:
-    """Labels of the objects that the camera sees, nearest first; DontCare areas last.
+    """Return the labels of the objects that the camera sees, nearest first; DontCare areas last.
 
-    An object is DontCare if too few of its points lie in the image or too little of it is visible, and is left out
-    if nothing of it is visible or it lies outside the image.
+    An object is DontCare if too few of its points are in the image or too little of it is visible, and is left out
+    if none of it is visible or it is outside the image.
 
     Args:
         targets: the objects (M).
-        hits: how many of their firings are hidden.
+        hits: number of their occluded firings.
         owner: (N,) object index, or negative, of each point in the image.
         calib: the camera.
-        config: from how many points and what visible share on an object is labelled.
+        config: least number of points and visible fraction of a labelled object.
     """
     points, visible = evidence(hits, owner)
     _, truncated = image_boxes(_boxes(targets), calib)
@@ -67,10 +67,10 @@ def label_camera_view(
 def label_all_around(
     targets: tuple[Target, ...], hits: Hits, owner: Owners, calib: Calibration, config: SceneConfig
 ) -> list[KittiObject]:
-    """Labels of all objects that return a point, nearest first.
+    """Return the labels of all objects with a return, nearest first.
 
-    Arguments are as for `label_camera_view`, but `owner` (N,) is of all points. See the top of the file for what the
-    fields mean where there is no camera.
+    Arguments are as for `label_camera_view`, but `owner` (N,) is of all points. See the module docstring for the
+    meaning of the fields without a camera.
     """
     points, visible = evidence(hits, owner)
     _, truncated = image_boxes(_boxes(targets), calib)
@@ -88,18 +88,18 @@ def label_all_around(
 
 
 def occlusion_around(points: int, visible_share: float, config: SceneConfig) -> int:
-    """Occlusion state 0..3 of an object of which that many points are there and that share is visible."""
+    """Return the occlusion state 0..3 of an object by its number of points and visible fraction."""
     hardly = points < config.min_points or visible_share < config.min_visible_share
     return UNKNOWN if hardly else occlusion_state(visible_share)
 
 
 def occlusion_state(visible_share: float) -> int:
-    """KITTI's occlusion state 0..3 of an object of which this share is visible."""
+    """Return KITTI's occlusion state 0..3 of an object by its visible fraction."""
     return sum(step >= float(visible_share) for step in OCCLUSION_STEPS)
 
 
 def dont_care(bbox: tuple[float, float, float, float]) -> KittiObject:
-    """An area of the image in which detections count neither as right nor as wrong."""
+    """Return an area of the image in which detections are ignored."""
     return KittiObject("DontCare", -1, -1, -10, bbox, -1, -1, -1, -1000, -1000, -1000, -10)
 
 
@@ -112,11 +112,11 @@ def _objects(targets: tuple[Target, ...], calib: Calibration) -> list[KittiObjec
 
 
 def nearest_first(targets: tuple[Target, ...]) -> npt.NDArray[np.int64]:
-    """Indices (M,) of the objects by their distance in metres from the sensor."""
+    """Return the indices (M,) of the objects by their distance in metres from the sensor."""
     return np.argsort(np.hypot(*_boxes(targets)[:, :2].T), kind="stable")
 
 
 def evidence(hits: Hits, owner: Owners) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.float64]]:
-    """Number of points of each object (M,), by the `owner` (N,) of each point, and its visible share."""
+    """Return the number of points of each object (M,), by the `owner` (N,) of each point, and its visible fraction."""
     points = np.bincount(owner[owner >= 0], minlength=len(hits.alone))
     return points, hits.visible / np.maximum(hits.alone, 1)

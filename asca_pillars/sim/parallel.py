@@ -27,7 +27,7 @@ def check_counts(counts: dict[str, int], val_share: float) -> None:
 
 
 def held_out(count: int, share: float) -> int:
-    """Number of frames or sequences for validation: at least one, where one is left to train on."""
+    """Return the number of frames or sequences for validation: at least one, if one remains for training."""
     rounded = round(count * share)
     return min(max(rounded, 1), count - 1) if 0 < share < 1 and count > 1 else rounded
 

@@ -1,4 +1,4 @@
-"""Datasets of simulated scans or drives: what `asca simulate` writes."""
+"""Datasets of simulated scans or drives, as of `asca simulate`."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,12 +13,12 @@ FRAMES, LENGTH = 100, 100
 
 @dataclass(frozen=True)
 class Simulated:
-    """A simulated dataset.
+    """Simulated dataset.
 
     Attributes:
         out: its folder, for `train` and `evaluate`.
         scans: folder of its scans, for `detect_scans`.
-        frames: how many there are.
+        frames: number of frames.
     """
 
     out: Path
@@ -43,7 +43,7 @@ def simulate(
     """Write labelled scans of simulated streets in KITTI's layout, or short drives as a dataset of boxes.
 
     Args:
-        out: the folder; a run that was interrupted goes on.
+        out: the folder; an interrupted run is resumed.
         frames: single scans to write; None: 100.
         sequences: drives to write instead.
         length: scans of each drive at 10 Hz; None: 100.

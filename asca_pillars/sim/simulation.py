@@ -46,9 +46,9 @@ MARGIN_PX = 3.0  # points are rounded to millimetres
 
 
 def outside_image(firings: Firings, calib: Calibration) -> npt.NDArray[np.bool_]:
-    """(K,C) firings all of whose returns lie beyond one border of the image, or behind the camera.
+    """Return (K,C) firings all of whose returns are beyond one border of the image, or behind the camera.
 
-    What lies beyond a border is a half space (x, y, z, 1) * plane > 0, so that a ray lies there if it does at the
+    The space beyond a border is a half space (x, y, z, 1) * plane > 0, so that a ray is in it if it is at the
     nearest and at the farthest range.
     """
     u, v, depth = calib.p2 @ calib.rect_from_lidar_matrix
@@ -80,7 +80,7 @@ class SimulationConfig(Strict):
     """Settings of a simulation.
 
     Attributes:
-        field_of_view: "full" is a whole revolution like KITTI's files, of which only what the camera sees is labelled;
+        field_of_view: "full" is a whole revolution like KITTI's files, in which only the camera's view is labelled;
             "camera" keeps only that part, casts a quarter of the rays and gives the same labels and the same points
             there; "around" is the revolution of "full" with labels in every direction (see `annotation`).
     """
@@ -92,7 +92,7 @@ class SimulationConfig(Strict):
 
 @dataclass(frozen=True)
 class Frame:
-    """One labelled scan: points (N,4) float32 x, y, z metres in the LiDAR frame and reflectance 0..1."""
+    """Labelled scan: points (N,4) float32 x, y, z metres in the LiDAR frame and reflectance 0..1."""
 
     points: npt.NDArray[np.float32]
     objects: list[KittiObject]
@@ -100,19 +100,19 @@ class Frame:
 
 
 RAY_KEYS = 1 << 62
-"""Rays of a scan draw by a key below it, which an int64 holds."""
-_BEYOND_THE_IMAGE_DEG = 1.0  # firings end at the image; what stands across its border is whole
+"""Upper bound of the random keys of a scan's rays, which fit an int64."""
+_BEYOND_THE_IMAGE_DEG = 1.0  # firings end at the image; objects across its border are complete
 
 
 def built_half_angle_rad(config: SimulationConfig) -> float:
-    """Angle to each side of straight ahead within which bodies are built."""
+    """Return the angle to each side of straight ahead within which bodies are built."""
     if config.field_of_view != "camera":
         return np.pi
     return float(np.deg2rad(config.lidar.camera_half_angle_deg + _BEYOND_THE_IMAGE_DEG))
 
 
 def simulate_frame(seed: int, index: int, config: SimulationConfig | None = None) -> Frame:
-    """Frame `index` of the data set `seed`: the same for every call, whatever other frames are made."""
+    """Simulate frame `index` of the data set `seed`: the same for every call, whatever other frames are simulated."""
     config = config or SimulationConfig()
     camera_only, around = config.field_of_view == "camera", config.field_of_view == "around"
     scene = draw_scene(config.scene, draws_of(seed, index, 0))
@@ -133,15 +133,15 @@ def take_scan(
     noise: np.random.Generator,
     numbers: Sequence[int] | None = None,
 ) -> tuple[Hits, Returns]:
-    """Scan a scene: what each firing meets, and the points (N, 4) that the sensor makes of it.
+    """Scan a scene: return the hit of each firing, and the points (N, 4) of the sensor.
 
     Args:
-        scene: in the LiDAR frame.
-        config: of the scene and the sensor.
-        firings: of this scan.
-        seed: of the bodies, and `numbers` of each, as for `world.scene.build`.
-        noise: of this scan.
-        numbers: of the bodies.
+        scene: scene in the LiDAR frame.
+        config: settings of the scene and the sensor.
+        firings: firings of this scan.
+        seed: seed of the bodies, and `numbers` of each, as for `world.scene.build`.
+        noise: generator of this scan.
+        numbers: numbers of the bodies.
     """
     camera_only = config.field_of_view == "camera"
     if camera_only:
@@ -172,12 +172,12 @@ def simulate(
 
     Args:
         out: the folder; with a cluster, one that every machine mounts at the same place.
-        frames: how many.
-        seed: of the whole data set.
+        frames: number of frames.
+        seed: seed of the whole data set.
         workers: processes, without a cluster.
-        config: what to simulate.
+        config: settings of the simulation.
         val_share: 0..1.
-        progress: whether it is shown, or what is called after each frame.
+        progress: whether it is shown, or a callback after each frame.
         cluster: address of a Ray cluster that does the work, `local` for one on this machine; None: processes.
 
     Raises:
@@ -213,18 +213,18 @@ def simulate(
 
 
 def require_own_frames(out: Path) -> None:
-    """Make sure that `simulate` may write into `out`; OutputError names what is not ours to replace."""
+    """Make sure that `simulate` may write into `out`; OutputError names foreign files."""
     folders = [f"training/{name}" for name in ("velodyne", "label_2", "calib")]
     require_own_simulation(out, ("seed", "scene", "lidar", "field_of_view"), folders)
 
 
 def frame_id(index: int) -> str:
-    """KITTI's name of a frame: six digits."""
+    """Return KITTI's name of a frame: six digits."""
     return f"{index:06d}"
 
 
 def _is_complete(split: KittiSplit, index: int) -> bool:
-    """The scan is written last: where it is, the frame is complete."""
+    """Return whether a frame is complete: its scan is written last."""
     return split.scan_path(frame_id(index)).exists()
 
 
@@ -240,7 +240,7 @@ KIND = "simulation"
 
 
 def load_simulation_config(path: str | None, view: str | None = None) -> SimulationConfig:
-    """Read a YAML file with `scene`, `lidar` and `field_of_view`, of each what differs from the defaults.
+    """Read a YAML file with `scene`, `lidar` and `field_of_view`, each with its differences from the defaults.
 
     Args:
         path: the file, or the name of one in configs/simulation/; None for the defaults, which imitate KITTI.

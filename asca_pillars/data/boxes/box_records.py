@@ -4,8 +4,8 @@ A record has a class and seven numbers, in the LiDAR frame (x forward, y left, z
 
     class, x_m, y_m, z_m (of the box's center), length_m, width_m, height_m, yaw_rad (counter-clockwise from x)
 
-and may have a `score` and a `track_id`; other keys are left alone. A name may go without its unit (`x`, `yaw`). Three
-kinds of files hold records:
+and may have a `score` and a `track_id`; other keys are ignored. The unit may be left out of a name (`x`, `yaw`). Three
+types of files hold records:
 
     *.jsonl  a line for each frame: {"scan": "scans/000000.bin", "boxes": [record, ...], ...}
     *.json   one frame: {"boxes": [record, ...], ...}
@@ -31,13 +31,13 @@ from asca_pillars.geometry.boxes import wrap_angle
 
 FIELDS = ("x_m", "y_m", "z_m", "length_m", "width_m", "height_m", "yaw_rad")
 _SHORT = {name.rpartition("_")[0]: name for name in FIELDS}
-_TOO_LARGE = 1e6  # for any number; a box is never a thousand kilometres away
+_TOO_LARGE = 1e6  # for any number, metres
 _DECIMALS = 4  # in written files
 _LAST_TIME_S = 1e18  # beyond int64's nanoseconds
 
 
 class BoxRecords(NamedTuple):
-    """The N records of one frame.
+    """N records of one frame.
 
     `boxes` (N, 7) float32, LiDAR frame; `types` class of each; `scores` (N,) float32, NaN where a record has none;
     `track_ids` None where a record has none.
@@ -50,9 +50,9 @@ class BoxRecords(NamedTuple):
 
 
 class NamedRecords(NamedTuple):
-    """Records of a frame, the path of its scan as stated, and their place in the file: FILE:LINE.
+    """Records of a frame, the stated path of its scan, and their place in the file: FILE:LINE.
 
-    `time_s` is the frame's time stamp, `detector` the scope of the detector; None where a line states none.
+    `time_s` is the frame's time stamp, `detector` the scope of the detector; None if a line does not state it.
     """
 
     scan: str
@@ -63,10 +63,10 @@ class NamedRecords(NamedTuple):
 
 
 def read_frames(path: Path) -> Iterator[NamedRecords]:
-    """The frames of a *.jsonl or *.csv file, in the order in which they first appear.
+    """Yield the frames of a *.jsonl or *.csv file, in the order in which they first appear.
 
     Raises:
-        DatasetError: the file cannot be read, or a record is wrong; names file, line, value and remedy.
+        DatasetError: the file cannot be read, or a record is invalid; names file, line, value and remedy.
     """
     if path.suffix.lower() == ".jsonl":
         yield from _json_lines(path)
@@ -85,7 +85,7 @@ def read_frames(path: Path) -> Iterator[NamedRecords]:
 
 
 def read_frame_file(path: Path) -> BoxRecords:
-    """The records of a *.json or *.csv file that belongs to one frame; an empty .csv is a frame without objects.
+    """Read the records of a *.json or *.csv file of one frame; an empty .csv is a frame without objects.
 
     Raises:
         DatasetError: as `read_frames`.
@@ -97,7 +97,7 @@ def read_frame_file(path: Path) -> BoxRecords:
 
 
 def read_time(path: Path) -> float | None:
-    """The time stamp, seconds, that a *.json file of one frame states as `time_s`; None: none, as in a .csv.
+    """Read the time stamp `time_s`, seconds, of a *.json file of one frame; None if it has none, as a .csv.
 
     Raises:
         DatasetError: the file cannot be read.
@@ -111,7 +111,7 @@ def records_from(
     scores: Sequence[float] | NDArray[np.floating] | None = None,
     track_ids: Sequence[str | None] | None = None,
 ) -> BoxRecords:
-    """Records of boxes (N, 7), metres and radians, that are arrays already."""
+    """Return records of arrays of boxes (N, 7), metres and radians."""
     count = len(types)
     return BoxRecords(
         np.asarray(boxes, np.float32).reshape(count, 7),
@@ -124,7 +124,7 @@ def records_from(
 def json_line(
     scan: str, records: BoxRecords, time_s: float | None = None, detector: DetectorScope | None = None
 ) -> str:
-    """One line of a *.jsonl file, with its line break, of a scan with this time stamp, found by this detector."""
+    """Return the line of a scan for a *.jsonl file, with line break, time stamp and detector."""
     boxes = []
     for box, kind, score, track_id in zip(*records, strict=True):
         record: dict[str, Any] = {"class": kind}
@@ -144,14 +144,14 @@ def json_line(
 
 
 def can_be_written(boxes: NDArray[np.floating]) -> NDArray[np.bool_]:
-    """Mask of the boxes (N, 7), metres and radians, that can be read again from the output of `json_line`."""
+    """Return the mask of the boxes (N, 7), metres and radians, whose output by `json_line` can be read again."""
     written = np.round(np.asarray(boxes, np.float64), _DECIMALS)
-    within = (np.abs(written) < _TOO_LARGE).all(axis=1)  # not where a number is not finite
+    within = (np.abs(written) < _TOO_LARGE).all(axis=1)  # False where a number is not finite
     return np.asarray(within & (written[:, 3:6] > 0).all(axis=1) & (np.abs(written[:, 6]) <= LARGEST_YAW_RAD))
 
 
 def _json_lines(path: Path) -> Iterator[NamedRecords]:
-    for number, line in enumerate(io.StringIO(_text(path)), start=1):  # text within JSON may hold other line breaks
+    for number, line in enumerate(io.StringIO(_text(path)), start=1):  # text within JSON may contain other line breaks
         if not line.strip():
             continue
         place = f"{path}:{number}"
@@ -167,7 +167,7 @@ def _time_s(content: Any) -> float | None:
     time_s = content.get("time_s") if isinstance(content, dict) else None
     if isinstance(time_s, bool) or not isinstance(time_s, int | float):
         return None
-    return float(time_s) if abs(time_s) < _LAST_TIME_S else None  # compared: a whole number may exceed any float
+    return float(time_s) if abs(time_s) < _LAST_TIME_S else None  # compared, because an integer may exceed any float
 
 
 def _json_records(content: Any, place: str) -> BoxRecords:
@@ -180,7 +180,7 @@ def _json_records(content: Any, place: str) -> BoxRecords:
 
 
 def _of_other_tool(content: Any) -> str | None:
-    """Advice for the file of a known labelling tool; None if it is not one of these."""
+    """Return advice for the file of a known labelling tool; None for other files."""
     if isinstance(content, dict) and "boxes" not in content and isinstance(content.get("objects"), list):
         tool = ("Supervisely", "supervisely") if "figures" in content else ("labelCloud", "labelcloud")
     elif isinstance(content, list) and content and all(isinstance(item, dict) and "psr" in item for item in content):
@@ -267,7 +267,7 @@ def _number(value: Any, name: str, place: str) -> float:
 
 def _text(path: Path) -> str:
     try:
-        return read_text(path, DatasetError)  # spreadsheets put a mark before the first name
+        return read_text(path, DatasetError)  # spreadsheets write a byte order mark before the first name
     except UnicodeDecodeError:
         raise DatasetError(f"{path}: not UTF-8 text; save it as UTF-8") from None
     except OSError as error:

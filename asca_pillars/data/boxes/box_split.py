@@ -1,7 +1,7 @@
-"""A dataset with boxes in the LiDAR frame, without a camera and without a calibration.
+"""Dataset with boxes in the LiDAR frame, without a camera and without a calibration.
 
-root/dataset.yaml                 where the rest is; may be empty
-     scans/...                    scans of any format, in folders as they come; or anywhere else, by `scans:`
+root/dataset.yaml                 paths and settings; may be empty
+     scans/...                    scans of any format, in any folders; or elsewhere, by `scans:`
      labels.jsonl or labels.csv   boxes of all frames, or
      labels/<frame>.json or .csv  of each frame (`box_records`), by `labels:`
      ImageSets/train.txt, val.txt one frame id per line
@@ -9,7 +9,7 @@ root/dataset.yaml                 where the rest is; may be empty
 Labels are in the scans' own frame, as `asca detect` writes boxes. Points and boxes are given in the mounting's level
 frame: x forward, y left, z up.
 
-A frame's id is the path of its scan below `scans`, without the suffix. Frames are those that have labels; with one .csv
+A frame's id is the path of its scan below `scans`, without the suffix. Every scan with labels is a frame; with one .csv
 for all, every scan is a frame and one without a row has no objects.
 """
 
@@ -42,7 +42,7 @@ _DEEPEST = 64
 
 
 class BoxFrame(NamedTuple):
-    """A scan and its labels; records and time of a file for all frames, None where the frame has a file of its own."""
+    """Scan and its labels; records and time of a file for all frames, None if the frame has a file of its own."""
 
     scan: Path
     label_file: Path
@@ -51,24 +51,24 @@ class BoxFrame(NamedTuple):
 
     @property
     def records(self) -> BoxRecords:
-        """The boxes; DatasetError if the frame's own file is damaged."""
+        """Boxes of the frame; DatasetError if its own file is damaged."""
         return read_frame_file(self.label_file) if self.file_records is None else self.file_records
 
     @property
     def time_s(self) -> float | None:
-        """The time stamp that the labels state, if any; DatasetError as `records`."""
+        """Time stamp of the labels, if any; DatasetError as `records`."""
         return read_time(self.label_file) if self.file_records is None else self.file_time_s
 
 
 def find_frames(labels: Path, scans: Path) -> dict[str, BoxFrame]:
-    """Every labelled frame by its id.
+    """Return all labelled frames by their ids.
 
     Args:
         labels: a .jsonl or .csv file for all frames, or a folder with a .json or .csv for each.
-        scans: folder that the scans are below.
+        scans: base folder of the scans.
 
     Raises:
-        DatasetError: labels that are missing, wrong, given twice, or of a scan that is not there.
+        DatasetError: labels that are missing, invalid, given twice, or of a missing scan.
     """
     if not scans.is_dir():
         raise DatasetError(f"{scans}: no such folder; give the one that the scans are below as `scans`")
@@ -98,12 +98,12 @@ def find_frames(labels: Path, scans: Path) -> dict[str, BoxFrame]:
 
 
 def frame_id_of(path: Path, scans: Path) -> str:
-    """The id of the frame whose scan is at `path`, below the folder `scans`."""
+    """Return the id of the frame whose scan is at `path`, below the folder `scans`."""
     return path.relative_to(scans).with_suffix("").as_posix()
 
 
 def _find_scan(scan: str, scans: Path) -> Path | None:
-    """The longest end of the path `scan` that is a file below `scans`: a label may name its scan from elsewhere."""
+    """Find the longest end of the path `scan` that is a file below `scans`: labels may have paths of other machines."""
     parts = PurePosixPath(scan.replace("\\", "/")).parts
     if ".." in parts:
         return None
@@ -142,15 +142,15 @@ ALL_AROUND_DEG = 360.0
 
 @dataclass(frozen=True)
 class BoxDataset(ScanSettings):
-    """dataset.yaml: paths of scans and labels, and settings that hold for all scans.
+    """dataset.yaml: paths of scans and labels, and settings of all scans.
 
     Attributes:
         scans: folder of the scans, relative to the dataset or absolute.
         labels: a .jsonl or .csv file for all frames, or a folder with a .json or .csv for each; relative or absolute.
-        labeled_view_deg: angle that is labelled, half of it to each side of straight ahead, such as a camera's view:
-            nothing is learnt from what lies outside. 360: everywhere.
-        sensor_position: x, y, z of the sensor in the scans' own frame, metres, where that is the vehicle's: from there
-            it follows what an inserted object hides.
+        labeled_view_deg: labelled field of view, centered ahead, such as a camera's: data outside are not used in
+            training. 360: everywhere.
+        sensor_position: x, y, z of the sensor in the scans' own frame, metres, if that is the vehicle's: occlusion by
+            inserted objects is computed from there.
     """
 
     scans: str = "scans"
@@ -166,7 +166,7 @@ class BoxDataset(ScanSettings):
 
 @dataclass(frozen=True)
 class BoxSplit:
-    """The frames of one list of such a dataset. `name` is a list in ImageSets/, or "training" for every frame."""
+    """Frames of one list of such a dataset. `name` is a list in ImageSets/, or "training" for every frame."""
 
     root: str | Path
     name: str = "training"
@@ -176,12 +176,12 @@ class BoxSplit:
 
     @property
     def has_camera(self) -> bool:
-        """True if objects are labelled only within an angle ahead."""
+        """Whether objects are labelled only within an angle ahead."""
         return self.settings.labeled_view_deg < ALL_AROUND_DEG
 
     @cached_property
     def settings(self) -> BoxDataset:
-        """The dataset's dataset.yaml; ConfigError if it cannot be used."""
+        """Contents of the dataset's dataset.yaml; ConfigError if it is invalid."""
         return read_settings(BoxDataset, Path(self.root) / DATASET_FILE, (), {})
 
     @cached_property
@@ -208,15 +208,15 @@ class BoxSplit:
 
     @property
     def labels_path(self) -> Path:
-        """The file or folder of the labels."""
+        """File or folder of the labels."""
         return Path(self.root) / self.settings.labels
 
     @cached_property
     def frame_ids(self) -> tuple[str, ...]:
-        """The list's frames, sorted, without repetitions; all of them have a scan and labels.
+        """Frames of the list, sorted, without repetitions; all of them have a scan and labels.
 
         Raises:
-            DatasetError: the list or the labels are missing, empty or wrong, or have no such frame.
+            DatasetError: the list or the labels are missing, empty or invalid, or lack a listed frame.
         """
         if self.name == "training":
             return tuple(sorted(self._frames))
@@ -234,11 +234,11 @@ class BoxSplit:
         return {one: time_s for one in self.frame_ids if (time_s := self._frames[one].time_s) is not None}
 
     def scan_path(self, frame_id: str) -> Path:
-        """The frame's scan."""
+        """Return the path of the frame's scan."""
         return self._frames[frame_id].scan
 
     def input_paths(self, frame_id: str) -> tuple[Path, ...]:
-        """The scan and the file that holds its labels."""
+        """Return the paths of the scan and of its label file."""
         return self._frames[frame_id].scan, self._frames[frame_id].label_file
 
     def require_files(self) -> None:
@@ -246,39 +246,39 @@ class BoxSplit:
         self.frame_ids  # noqa: B018
 
     def points(self, frame_id: str, *, camera_view: bool = False) -> NDArray[np.float32]:
-        """(N, 4) of the scan, metres, level frame; with `camera_view` those within the labelled angle."""
+        """Return the scan's points (N, 4), metres, level frame; with `camera_view` those within the labelled angle."""
         points = self._levelled(self._read(self.scan_path(frame_id)))
         return points[self.in_labeled_view(frame_id, points)] if camera_view else points
 
     def in_labeled_view(self, frame_id: str, positions: NDArray[np.float32]) -> NDArray[np.bool_]:
-        """Mask of the positions (N, 3 or more), metres, level frame, within the labelled angle."""
-        if not self.has_camera:  # rounded, the angle straight behind is more than half a turn
+        """Return the mask of the positions (N, 3 or more), metres, level frame, within the labelled angle."""
+        if not self.has_camera:  # the rounded angle straight behind may exceed half a turn
             return np.ones(len(positions), bool)
         angles = np.arctan2(positions[:, 1], positions[:, 0])
         return np.asarray(np.abs(angles) <= np.radians(self.settings.labeled_view_deg / 2))
 
     def stored_points(self, frame_id: str) -> NDArray[np.float32]:
-        """(N, 4) all of the file in the level frame; reflectance divided by the dataset's scale."""
+        """Return all points (N, 4) of the file in the level frame; reflectance divided by the dataset's scale."""
         points = stored_points(self.scan_path(frame_id), columns=self.settings.columns)
         if self._reflectance_scale != "auto":
             points[:, 3] /= self._reflectance_scale
         return self._levelled(points)
 
     def points_state(self, frame_id: str) -> tuple[int, ...]:
-        """Size and time of the scan, and dataset.yaml with the pose that it names and the scale that it leaves open."""
+        """Return size and time of the scan, and a checksum of dataset.yaml, its pose and the reflectance scale."""
         state = self.scan_path(frame_id).stat()
         return state.st_size, state.st_mtime_ns, self._settings_crc
 
     def label_types(self, frame_id: str) -> list[str]:
-        """The class of each box."""
+        """Return the class of each box."""
         return list(self.records(frame_id).types)
 
     def label_yaws(self, frame_id: str) -> NDArray[np.float64]:
-        """(M,) yaw of each box in radians, in the scan's own frame, within half a turn."""
+        """Return the yaw (M,) of each box in radians, in the scan's own frame, within half a turn."""
         return self.records(frame_id).boxes[:, 6].astype(np.float64)
 
     def labeled_boxes(self, frame_id: str, types: Container[str] | None = None) -> LabeledBoxes:
-        """The frame's boxes in the level frame, all or those of `types`."""
+        """Return the frame's boxes in the level frame, all or those of `types`."""
         records = self.records(frame_id)
         kept = [row for row, kind in enumerate(records.types) if types is None or kind in types]
         boxes = records.boxes[kept]
@@ -287,7 +287,7 @@ class BoxSplit:
         return LabeledBoxes(boxes, tuple(records.types[row] for row in kept))
 
     def records(self, frame_id: str) -> BoxRecords:
-        """The frame's boxes as they are labelled, in the scan's own frame; DatasetError if its file is damaged."""
+        """Return the frame's labelled boxes in the scan's own frame; DatasetError if its file is damaged."""
         return self._frames[frame_id].records
 
     @cached_property
@@ -316,5 +316,5 @@ class BoxSplit:
 
     @cached_property
     def _frames(self) -> dict[str, BoxFrame]:
-        """Every labelled frame of the dataset, by its id."""
+        """All labelled frames of the dataset, by id."""
         return find_frames(self.labels_path, self.scans_folder)

@@ -9,11 +9,11 @@ from asca_pillars.detection.spec import DetectorSpec
 
 Interval = tuple[float, float]
 
-_FARTHEST_M = 1e6  # beyond it a number is a mistake
+_FARTHEST_M = 1e6  # larger numbers are errors
 
 
 class DetectorScope(NamedTuple):
-    """The classes of a detector, and its ranges seen from above.
+    """Classes of a detector, and its ranges in bird's-eye view.
 
     `ranges_m` holds (lowest, highest) along x and y, metres, in level axes (x forward, y left); None: every direction.
     """
@@ -22,14 +22,14 @@ class DetectorScope(NamedTuple):
     ranges_m: tuple[Interval, Interval] | None
 
     def holds(self, boxes: NDArray[np.floating]) -> NDArray[np.bool_]:
-        """Mask (N,) of the boxes (N, 7), metres and radians, level axes, whose center lies within the ranges."""
+        """Return the mask (N,) of the boxes (N, 7), m and rad, level axes, whose center is within the ranges."""
         inside = np.ones(len(boxes), bool)
         for axis, (low, high) in enumerate(self.ranges_m or ()):
             inside &= (boxes[:, axis] >= low) & (boxes[:, axis] < high)
         return inside
 
     def where(self) -> str:
-        """The ranges in words."""
+        """Return the ranges in words."""
         if self.ranges_m is None:
             return "every direction"
         (x_low, x_high), (y_low, y_high) = self.ranges_m
@@ -42,12 +42,12 @@ class DetectorScope(NamedTuple):
 
 
 def detector_scope(spec: DetectorSpec, *, around: bool) -> DetectorScope:
-    """The scope of a detector; `around` says that it looks in every direction, by turned passes."""
+    """Return the scope of a detector; `around`: it covers every direction, by turned passes."""
     return DetectorScope(spec.class_names, None if around else (spec.ranges.x_m, spec.ranges.y_m))
 
 
 def scope_from_json(content: Any) -> DetectorScope | None:
-    """The scope that `content` states; None if it states none, as files of other programs do not."""
+    """Parse a stated scope; return None if there is none, as in files of other programs."""
     if not isinstance(content, dict) or "ranges_m" not in content:
         return None
     classes, ranges_m = content.get("classes"), content["ranges_m"]

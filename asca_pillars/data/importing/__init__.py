@@ -1,1 +1,1 @@
-"""Published datasets as one layout whose scans stay where they are."""
+"""Import of published datasets into one layout; scans are referenced, not copied."""

@@ -20,22 +20,22 @@ from asca_pillars.scans.feather import feather_table
 from asca_pillars.scans.find_scans import files_below
 
 AXLE_HEIGHT_M = 0.33
-"""Of the vehicle's frame above the ground: a wheel's radius. The sweeps themselves show 0.35."""
+"""Height of the vehicle's frame above the ground: a wheel's radius. Measured in the sweeps: 0.35."""
 SENSOR_POSITION_M = (1.35, 0.0, 1.64)
-"""Of the upper one of the two stacked LiDARs, by the calibrations that come with the logs."""
+"""Position of the upper one of the two stacked LiDARs, from the logs' calibrations."""
 _CENTER = ("tx_m", "ty_m", "tz_m")
 _SIZE = ("length_m", "width_m", "height_m")
 _TURN = ("qw", "qx", "qy", "qz")
 
 
 def read_argoverse2(root: Path) -> Imported:
-    """Every sweep of every log below `root` that has boxes.
+    """Read every sweep with boxes of every log below `root`.
 
     Raises:
         DatasetError: no log, or a file that is not of this format.
         AscaError: pyarrow is not installed.
     """
-    root = root.resolve()  # scans keep their names below it, where they are links too
+    root = root.resolve()  # scans are named relative to it, including links
     logs = sorted(path.parent for path in files_below(root) if path.name == "annotations.feather")
     if not logs:
         raise DatasetError(f"{root}: no annotations.feather below; give a folder of Argoverse 2 logs")
@@ -69,14 +69,14 @@ def _frames(log: Path, left_out: LeftOut) -> list[ImportedFrame]:
                 raise ValueError(f"no box with finite numbers, positive sizes and a rotation ({values})")
             kept[int(stamps[row])].append(row)
         except ValueError as reason:
-            kept[int(stamps[row])]  # the sweep stays
+            kept[int(stamps[row])]  # the sweep is kept
             left_out.add("boxes", f"{path}, row {row}", reason)
     frames = []
     for stamp, rows in sorted(kept.items()):
         folders = (log / "sensors" / "lidar", log / "lidar")
         scan = next((scan for folder in folders if (scan := folder / f"{stamp}.feather").is_file()), None)
         if scan is None:
-            continue  # a part of a log may have been downloaded
+            continue  # only a part of a log may have been downloaded
         types, tracks = (table[name][rows].tolist() for name in ("category", "track_uuid"))
         frames.append(ImportedFrame(scan, records_from(boxes[rows], types, None, tracks), log.name))
     return frames

@@ -1,4 +1,4 @@
-"""Boxes in CSV or JSON of one's own (`data.boxes.box_records`), with their scans in a folder."""
+"""Import of CSV or JSON boxes (`data.boxes.box_records`), with their scans in a folder."""
 
 from pathlib import Path
 
@@ -10,14 +10,14 @@ from asca_pillars.scans.scan_settings import ScanSettings
 
 
 def read_box_files(labels: Path, scans: Path, settings: ScanSettings) -> Imported:
-    """Every frame of a .jsonl or .csv file, or of a folder with a .json or .csv for each scan.
+    """Read every frame of a .jsonl or .csv file, or of a folder with a .json or .csv for each scan.
 
-    A recording is a folder of scans.
+    Each folder of scans is a recording.
 
     Args:
         labels: the file or folder.
         scans: folder of the scans.
-        settings: of the scans; labels are in the scans' own frame.
+        settings: settings of the scans; labels are in the scans' own frame.
 
     Raises:
         ConfigError: the pose cannot be read.
@@ -33,7 +33,7 @@ def read_box_files(labels: Path, scans: Path, settings: ScanSettings) -> Importe
 
 
 def dataset_settings(scans: Path, settings: ScanSettings) -> BoxDataset:
-    """The dataset of scans that lie as stated, by their absolute path.
+    """Return the settings of a dataset of these scans, by their absolute path.
 
     Raises:
         ConfigError: the pose cannot be read.

@@ -1,4 +1,4 @@
-"""Values of tables that others wrote: used where they are what the format says, else counted and named."""
+"""Validation of values from tables of other programs; invalid ones are counted and reported."""
 
 import reprlib
 from collections import Counter
@@ -7,40 +7,40 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-_LARGEST = 1e9  # of any number that is a length or an angle
+_LARGEST = 1e9  # of any length or angle
 _LONGEST_TEXT = 200
 _QUOTE = reprlib.Repr()
 _QUOTE.maxstring = _QUOTE.maxother = _QUOTE.maxlong = 60
 
 
 class LeftOut:
-    """What an import cannot use: how much of each kind, and the reason for the first of it."""
+    """Counts of unusable data by kind, with the reason for the first of each kind."""
 
     def __init__(self) -> None:
         self.counts: Counter[str] = Counter()
         self.first: dict[str, str] = {}
 
     def add(self, kind: str, place: object, reason: object) -> None:
-        """One more.
+        """Count one more.
 
         Args:
             kind: plural noun.
-            place: where it stands.
+            place: its location.
             reason: why it cannot be used.
         """
         self.counts[kind] += 1
         self.first.setdefault(kind, f"{place}: {reason}")
 
     def lines(self) -> list[str]:
-        """A sentence for each kind."""
+        """Return a sentence for each kind."""
         return [f"left out, {kind}: {count}, the first: {self.first[kind]}" for kind, count in self.counts.items()]
 
 
 def text_of(value: Any, name: str) -> str:
-    """A text of one line, blanks at its ends and several in a row removed.
+    """Return a text of one line with whitespace normalized.
 
     Raises:
-        ValueError: it is none, is empty or longer than a name is, or has characters that cannot be printed.
+        ValueError: it is not text, empty, longer than a name, or has unprintable characters.
     """
     text = " ".join(value.split()) if isinstance(value, str) and len(value) <= _LONGEST_TEXT else ""
     if not text or not text.isprintable():
@@ -49,10 +49,10 @@ def text_of(value: Any, name: str) -> str:
 
 
 def whole_number(value: Any, name: str) -> int:
-    """A whole number of 64 bits.
+    """Return an integer of 64 bits.
 
     Raises:
-        ValueError: it is none.
+        ValueError: it is not one.
     """
     number = int(value) if isinstance(value, int | np.integer) and not isinstance(value, bool) else None
     if number is None or not -(2**63) <= number < 2**63:
@@ -61,10 +61,10 @@ def whole_number(value: Any, name: str) -> int:
 
 
 def numbers(values: Any, count: int | None, name: str) -> NDArray[np.float64]:
-    """So many numbers of a list or array (N,), in double precision; with None for the count at least one.
+    """Return `count` numbers of a list or array (N,) in double precision; None: at least one.
 
     Raises:
-        ValueError: there are others, or one is no number, not finite or of no physical size.
+        ValueError: the count differs, or one is not a number, not finite or of no physical size.
     """
     if isinstance(values, np.ndarray) and values.dtype.kind in "iuf":
         array = values.astype(np.float64)
@@ -80,10 +80,10 @@ def numbers(values: Any, count: int | None, name: str) -> NDArray[np.float64]:
 
 
 def entry(row: Any, name: str) -> Any:
-    """The value of a row by its name.
+    """Return the value of a row by its name.
 
     Raises:
-        ValueError: the row has none, or is no row.
+        ValueError: the row has none, or is not a row.
     """
     if not isinstance(row, dict) or name not in row:
         raise ValueError(f"no `{name}`")

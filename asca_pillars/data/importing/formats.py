@@ -1,6 +1,6 @@
-"""Formats of labels by name: what `asca import --from` reads, and what `asca detect --write` writes.
+"""Label formats by name: those `asca import --from` reads, and those `asca detect --write` writes.
 
-To add one, write a module with its functions and name them here in a line. Nothing is imported before it is used.
+To add one, write a module with its functions and add an entry here. Modules are imported on first use.
 """
 
 import importlib
@@ -19,15 +19,15 @@ _PACKAGE = "asca_pillars.data.importing"
 
 @dataclass(frozen=True, kw_only=True)
 class LabelFormat:
-    """A format of labels.
+    """Label format.
 
     Attributes:
-        help: what SOURCE is, for the command line.
-        reads: "module:function" of this package; called with the source, and the next two say with what besides.
-        scans_elsewhere: the function also takes `scans` and `settings`, for the labels do not say where the scans are.
-        writes_scans: the function also takes `out`, for the scans lie in files of another kind.
-        writes: "module:function" that gives the files of a tool's labels; None if nothing writes this format.
-        extra: of this package, that is to be installed for it.
+        help: description of SOURCE for the command line.
+        reads: "module:function" of this package; called with the source, and with arguments as the next two state.
+        scans_elsewhere: the function also takes `scans` and `settings`, since the labels do not state the scans' place.
+        writes_scans: the function also takes `out`, since the scans are in files of another format.
+        writes: "module:function" that returns the files of a tool's labels; None if the format cannot be written.
+        extra: optional dependencies of this package that it needs.
     """
 
     help: str
@@ -38,13 +38,13 @@ class LabelFormat:
     extra: str | None = None
 
     def read(self, source: Path, *, out: Path, scans: Path | None, settings: "ScanSettings") -> "Imported":
-        """The frames of the source.
+        """Read the frames of the source.
 
         Args:
             source: the file or folder.
-            out: folder of the dataset that will be written.
-            scans: folder of the scans, where `scans_elsewhere`.
-            settings: how those scans lie.
+            out: output folder of the dataset.
+            scans: folder of the scans, if `scans_elsewhere`.
+            settings: settings of those scans.
 
         Raises:
             DatasetError: the source is not of this format.
@@ -55,10 +55,10 @@ class LabelFormat:
         return _function(self.reads)(source, **arguments)
 
     def files(self, frames: Sequence["ScanLabels"]) -> Mapping[str, str]:
-        """Texts by relative paths, as the tool reads them.
+        """Return the tool's files as texts by relative paths.
 
         Raises:
-            OutputError: the format cannot hold a label.
+            OutputError: the format cannot represent a label.
         """
         assert self.writes is not None
         return _function(self.writes)(frames)
@@ -70,7 +70,7 @@ def _function(place: str) -> Any:
 
 
 def _tool(module: str, name: str, help_text: str) -> LabelFormat:
-    """A labelling tool: read and written, with its scans elsewhere."""
+    """Return the format of a labelling tool: read and written, with its scans elsewhere."""
     return LabelFormat(
         help=help_text, reads=f"{module}:read_{name}", writes=f"{module}:write_{name}", scans_elsewhere=True
     )
@@ -100,4 +100,4 @@ FORMATS: Mapping[str, LabelFormat] = {
     "kitti-tracking": LabelFormat(help="the folder with training/", reads="kitti_tracking:read_kitti_tracking"),
 }
 TOOLS = tuple(name for name, form in FORMATS.items() if form.writes is not None)
-"""Names of the formats of labelling tools, which are read and written."""
+"""Names of the labelling tools' formats, which are both read and written."""

@@ -1,6 +1,6 @@
-"""What an import reads of any source, and the dataset that it writes of it (`data.boxes.box_split`).
+"""Frames imported from any source, and the dataset written from them (`data.boxes.box_split`).
 
-Nothing is copied that can be referred to.
+Scans are referenced, not copied.
 """
 
 import math
@@ -25,11 +25,11 @@ from asca_pillars.scans.find_scans import natural_order
 COMMAND = "asca import"
 LABELS_FILE = "labels.jsonl"
 MARKER = "# Written by `asca import`, which may replace lists and labels beside it; without this line it does not.\n"
-"""First line of the dataset.yaml of an import: others are written by hand, and so may be the labels beside them."""
+"""First line of an import's dataset.yaml: without it, the file and its labels are taken as written by hand."""
 
 
 class ImportedFrame(NamedTuple):
-    """A scan, its boxes in the LiDAR frame (x forward), its recording, and its time stamp if it has one."""
+    """Scan, its boxes in the LiDAR frame (x forward), its recording, and its time stamp if it has one."""
 
     scan: Path
     records: BoxRecords
@@ -38,9 +38,9 @@ class ImportedFrame(NamedTuple):
 
 
 class Imported(NamedTuple):
-    """The frames of a source, how its scans are to be read, and what of the source cannot be used.
+    """Frames of a source, the settings of its scans, and its unusable data.
 
-    `settings.scans` is the folder that the scans are below.
+    `settings.scans` is the base folder of the scans.
     """
 
     settings: BoxDataset
@@ -49,7 +49,7 @@ class Imported(NamedTuple):
 
 
 class ImportCounts(NamedTuple):
-    """What was written: frames of both lists, boxes by class, and what looks odd about them."""
+    """Counts of the written frames of both lists and boxes by class, and warnings about them."""
 
     train: int
     val: int
@@ -58,12 +58,12 @@ class ImportCounts(NamedTuple):
 
 
 def usable(imported: Imported) -> Imported:
-    """The same without the boxes and frames that could not be read again from a dataset; those are counted.
+    """Return the import without boxes and frames that a dataset could not represent; they are counted.
 
-    Names of classes lose line breaks and blanks at their ends.
+    Line breaks and blanks at the ends are removed from names of classes.
 
     Raises:
-        DatasetError: no frame remains, or no box because none can be used.
+        DatasetError: no frame remains, or no box is usable.
     """
     scans, left_out = Path(imported.settings.scans), imported.left_out
     frames: dict[str, ImportedFrame] = {}
@@ -88,11 +88,11 @@ def usable(imported: Imported) -> Imported:
 
 
 def _readable_id(frame: ImportedFrame, scans: Path) -> str:
-    """The frame's id; ValueError if a list of ids or the labels could not name it."""
+    """Return the frame's id; ValueError if a list of ids or the labels could not contain it."""
     if not frame.scan.is_relative_to(scans):
         raise ValueError(f"the scan is not below {scans}")
     name, frame_id = frame.scan.relative_to(scans).as_posix(), frame_id_of(frame.scan, scans)
-    frame_id.encode()  # of bytes that are no text there is no list
+    frame_id.encode()  # ids that are not valid text cannot be listed
     if "\\" in name or file_inside(scans, name) is None:
         raise ValueError(f"no scan {name[:200]!r} below {scans}")
     if frame_id.splitlines() != [frame_id.strip("\ufeff").strip()]:
@@ -118,10 +118,10 @@ def _usable_records(frame: ImportedFrame, left_out: LeftOut) -> BoxRecords:
 
 
 def renamed(imported: Imported, names: Mapping[str, str]) -> Imported:
-    """The same with classes of other names; several may get one name.
+    """Return the import with renamed classes; several may get one name.
 
     Raises:
-        ConfigError: a class that no box has, or a new name that is none.
+        ConfigError: a class that no box has, or an invalid new name.
     """
     try:
         names = {old: text_of(new, "the new name") for old, new in names.items()}
@@ -146,7 +146,7 @@ def require_own_dataset(out: Path, source: Path | None = None) -> None:
 
     Args:
         out: folder of the dataset.
-        source: what is imported; it may not be what an earlier import wrote there.
+        source: the source, which may not be the output of an earlier import.
 
     Raises:
         OutputError: it holds something else, such as a dataset that was written by hand.
@@ -203,7 +203,10 @@ def write_imported(out: Path, imported: Imported, val_share: float) -> ImportCou
 
 
 def _lists(frames: list[ImportedFrame], val_share: float) -> tuple[list[ImportedFrame], list[ImportedFrame]]:
-    """The last recordings for validation, or the end of the only one: neighboring scans look alike."""
+    """Return frames for training and the last recordings, or the end of the only one, for validation.
+
+    Neighboring scans are similar, so they are not split between the lists.
+    """
     recordings = list(dict.fromkeys(frame.recording for frame in frames))
     if len(recordings) > 1:
         held_out = set(recordings[len(recordings) - max(1, math.floor(val_share * len(recordings))) :])

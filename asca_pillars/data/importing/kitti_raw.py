@@ -1,7 +1,7 @@
 """KITTI's raw recordings: <date>/<drive>_sync/tracklet_labels.xml and velodyne_points/data/<frame>.bin.
 
 A tracklet has one size and a pose for each frame from its first one on, in the LiDAR's frame; its position is the
-middle of the box's bottom, its rz the yaw. Labels stand only where the camera looks. Format: the recordings'
+middle of the box's bottom, its rz the yaw. Only the camera's field of view is labelled. Format: the recordings'
 development kit, https://www.cvlibs.net/datasets/kitti/raw_data.php
 """
 
@@ -25,11 +25,11 @@ from asca_pillars.scans.find_scans import files_below, visible_files
 
 LABELS = "tracklet_labels.xml"
 _DOCTYPE = "<!DOCTYPE boost_serialization>"
-"""Stands in KITTI's own files."""
+"""Document type of KITTI's own files."""
 
 
 class _Labels(NamedTuple):
-    """Of one frame: boxes of 7 numbers, their types and their tracklets' numbers."""
+    """Boxes of 7 numbers, types and track numbers of one frame."""
 
     boxes: list[list[float]]
     types: list[str]
@@ -37,7 +37,7 @@ class _Labels(NamedTuple):
 
 
 def read_kitti_raw(root: Path) -> Imported:
-    """Every scan of every drive below `root` that has tracklets.
+    """Read every scan of every drive below `root` that has tracklets.
 
     Raises:
         DatasetError: no drive, or a file that is not of this format.
@@ -62,11 +62,11 @@ def _frames(drive: Path, left_out: LeftOut) -> list[ImportedFrame]:
 
 
 def _read_tracklets(path: Path, left_out: LeftOut) -> dict[int, _Labels]:
-    """The labels of each frame."""
+    """Read the labels of each frame."""
     labels: dict[int, _Labels] = defaultdict(lambda: _Labels([], [], []))
     try:
         text = read_text(path, DatasetError, errors="replace")
-        if "<!DOCTYPE" in text.replace(_DOCTYPE, "", 1):  # entities and attributes of one may unfold to any size
+        if "<!DOCTYPE" in text.replace(_DOCTYPE, "", 1):  # entities of a document type may expand to any size
             raise ValueError(f"another DOCTYPE than {_DOCTYPE}")
         tracklets = ElementTree.fromstring(text).findall("tracklets/item")
     except OSError as error:

@@ -1,7 +1,7 @@
 """KITTI's tracking benchmark: velodyne/<sequence>/<frame>.bin, label_02/<sequence>.txt, calib/<sequence>.txt.
 
 A line of a label file is one of the detection benchmark's with the frame and the track's number before it, in the
-rectified camera's frame; labels stand only where the camera looks. Format: the benchmark's development kit,
+rectified camera's frame; only the camera's field of view is labelled. Format: the benchmark's development kit,
 https://www.cvlibs.net/datasets/kitti/eval_tracking.php
 """
 
@@ -20,18 +20,18 @@ from asca_pillars.data.kitti import Calibration, KittiObject, boxes_from_objects
 from asca_pillars.scans.find_scans import visible_files
 
 LABELED_VIEW_DEG = 81.0
-"""Of KITTI's left color camera: 1242 pixels at a focal length of 721."""
+"""Field of view of KITTI's left color camera: 1242 pixels at a focal length of 721."""
 TYPES = {"Person": "Person_sitting", "Person (sitting)": "Person_sitting"}
-"""Names in KITTI's recordings, here and in the raw ones, of what its object benchmark calls otherwise."""
+"""Names in KITTI's tracking and raw recordings that differ in its object benchmark."""
 _LONGEST_FRAME = 20  # digits of a frame's number
 _Tracked = tuple[KittiObject, str]
 
 
 def read_kitti_tracking(root: Path) -> Imported:
-    """Every scan of every sequence that has labels.
+    """Read every scan of every sequence that has labels.
 
     Args:
-        root: the folder that holds training/, or training/ itself.
+        root: the folder that contains training/, or training/ itself.
 
     Raises:
         DatasetError: no sequence, or a file that is not of this format.
@@ -66,7 +66,7 @@ def _records(own: list[_Tracked], calibration: Calibration) -> BoxRecords:
 
 
 def _read_tracked(path: Path, left_out: LeftOut) -> dict[int, list[_Tracked]]:
-    """The objects of each frame with their track's number."""
+    """Read the objects of each frame with their track numbers."""
     try:
         lines = read_text(path, DatasetError, errors="replace").splitlines()
     except OSError as error:

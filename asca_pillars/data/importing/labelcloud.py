@@ -32,7 +32,7 @@ _TURN_DEG = 360.0
 
 
 def read_labelcloud(source: Path, scans: Path, settings: ScanSettings) -> Imported:
-    """Every label file below `source`; see `read_tool_labels`."""
+    """Read every label file below `source`; see `read_tool_labels`."""
     path = (source if source.is_dir() else source.parent) / _CLASSES
     unit = _unit(path) if path.is_file() else _DEGREES
 
@@ -57,7 +57,7 @@ def read_labelcloud(source: Path, scans: Path, settings: ScanSettings) -> Import
 
 
 def write_labelcloud(frames: Sequence[ScanLabels]) -> Mapping[str, str]:
-    """Files by relative paths: a JSON for each scan in degrees, and _classes.json."""
+    """Return files by relative paths: a JSON for each scan in degrees, and _classes.json."""
     names = class_names(frames)
     classes = {
         "classes": [

@@ -50,7 +50,7 @@ _Doubles = NDArray[np.float64]
 
 
 def read_nuscenes(root: Path) -> Imported:
-    """The key frames of LIDAR_TOP that are there.
+    """Read the available key frames of LIDAR_TOP.
 
     Args:
         root: the folder with samples/ and one v1.0-*/, or that v1.0-*/.
@@ -71,10 +71,10 @@ def read_nuscenes(root: Path) -> Imported:
 
 
 def _sensor_height_m(tables: Mapping[str, _Table]) -> float | None:
-    """The median over the vehicles' calibrations; None without any."""
+    """Return the median over the vehicles' calibrations; None without any."""
     heights = []
     for row in tables["calibrated_sensor"].values():
-        with contextlib.suppress(ValueError):  # named where a frame needs it
+        with contextlib.suppress(ValueError):  # reported where a frame needs it
             if _channel(row, tables) == CHANNEL:
                 heights.append(numbers(entry(row, "translation"), 3, "translation")[2])
     return round(float(np.median(heights)), 3) if heights else None
@@ -99,7 +99,7 @@ def _frames(tables: Mapping[str, _Table], folder: Path, data: Path, left_out: Le
             scan = file_inside(data, filename) if isinstance(filename, str) else None
             if scan is None:
                 if isinstance(filename, str) and ".." not in Path(filename).parts and not Path(filename).is_absolute():
-                    continue  # a part of the dataset may have been downloaded
+                    continue  # only a part of the dataset may have been downloaded
                 raise ValueError(f"filename is {str(filename)[:80]!r}, no file below {data}")
             changes = [_change(frame) for frame in (_linked(row, "ego_pose", tables), sensor)]
             own = labels.get(row["sample_token"], [])
@@ -136,7 +136,7 @@ def _records(
 
 
 def _change(row: _Row) -> tuple[_Doubles, _Doubles]:
-    """The rotation (3, 3) and the position (3,), metres, that a row states of what it is about in its parent frame."""
+    """Return the rotation (3, 3) and translation (3,), metres, of a row, to its parent frame."""
     turn = of_quaternions(numbers(entry(row, "rotation"), 4, "rotation"))
     if not np.isfinite(turn).all():
         raise ValueError(f"rotation is {row['rotation']}, no quaternion")
@@ -148,7 +148,7 @@ def _channel(sensor: _Row, tables: Mapping[str, _Table]) -> str:
 
 
 def _linked(row: _Row, name: str, tables: Mapping[str, _Table]) -> _Row:
-    """The row of the table `name` that a row names; ValueError if it names none."""
+    """Return the row of the table `name` that a row refers to; ValueError if there is none."""
     token = entry(row, f"{name}_token")
     if not isinstance(token, str) or token not in tables[name]:
         raise ValueError(f"{name}.json has no row {str(token)[:80]!r}")
@@ -166,7 +166,7 @@ def _tables_folder(root: Path) -> Path:
 
 
 def _table(folder: Path, name: str, left_out: LeftOut) -> _Table:
-    """The rows of a table by their tokens."""
+    """Read the rows of a table by their tokens."""
     path = folder / f"{name}.json"
     try:
         rows = json.loads(read_text(path, DatasetError))

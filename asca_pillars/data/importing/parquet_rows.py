@@ -1,4 +1,4 @@
-"""Rows of Apache Parquet files, some columns at a time; lists come as arrays."""
+"""Rows of Apache Parquet files, for selected columns; lists are returned as arrays."""
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -8,16 +8,16 @@ from asca_pillars.base.errors import AscaError, DatasetError
 from asca_pillars.base.input_files import require_content
 from asca_pillars.base.installation import install_command
 
-_BATCH = 8  # rows that are in memory at once: a range image has millions of numbers
+_BATCH = 8  # rows in memory at once: a range image has millions of numbers
 
 
 def parquet_rows(path: Path, columns: Sequence[str]) -> Iterator[dict[str, Any]]:
-    """The rows of a file by column: numbers and texts as they are, lists as NumPy arrays, None where there is nothing.
+    """Yield the rows of a file by column: numbers and texts unchanged, lists as NumPy arrays, missing values as None.
 
-    None also stands for a value that Python has no form of, such as a date in the year 300,000.
+    None also stands for a value that Python cannot represent, such as a date in the year 300,000.
 
     Raises:
-        DatasetError: no parquet file, or one without these columns.
+        DatasetError: not a parquet file, or one without these columns.
         AscaError: pyarrow is not installed.
     """
     try:
@@ -40,8 +40,8 @@ def parquet_rows(path: Path, columns: Sequence[str]) -> Iterator[dict[str, Any]]
 
 
 def _plain(value: Any) -> Any:
-    items: Any = getattr(value, "values", None)  # of a list; None of a list that is null
+    items: Any = getattr(value, "values", None)  # of a list; None for a null list
     try:
         return value.as_py() if not hasattr(items, "to_numpy") else items.to_numpy(zero_copy_only=False)
-    except (ValueError, TypeError, LookupError, OverflowError, NotImplementedError):  # Arrow's own are among them
+    except (ValueError, TypeError, LookupError, OverflowError, NotImplementedError):  # includes Arrow's own
         return None

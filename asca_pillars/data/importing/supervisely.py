@@ -1,11 +1,11 @@
-"""Supervisely's point cloud projects, and CVAT's Sly Point Cloud Format 1.0, which has their files.
+"""Supervisely's point cloud projects, and CVAT's Sly Point Cloud Format 1.0, which has the same files.
 
     meta.json                     the classes
     key_id_map.json               numbers of objects
     <dataset>/ann/<scan>.pcd.json objects, and a figure (cuboid_3d) for each box; radians
 
-They differ in what is ahead: a box of Supervisely with yaw 0 looks along y and `dimensions` are width, length and
-height; one of CVAT looks along x, and they are length, width and height. Formats: https://docs.supervisely.com (point
+Their forward axes differ: a box of Supervisely with yaw 0 faces y and `dimensions` are width, length and
+height; one of CVAT faces x, and they are length, width and height. Formats: https://docs.supervisely.com (point
 cloud annotation) and https://docs.cvat.ai (formats).
 """
 
@@ -39,26 +39,26 @@ _META, _KEYS = "meta.json", "key_id_map.json"
 _SHAPE = "cuboid_3d"
 _QUARTER = math.pi / 2
 _NAMESPACE = uuid.UUID("6c1de7d4-3f0e-4c52-9a2b-4f4d0c3e8a11")
-"""Namespace of keys, so that the same boxes get the same ones again."""
+"""Namespace of keys, so that the same boxes always get the same keys."""
 
 
 def read_supervisely(source: Path, scans: Path, settings: ScanSettings) -> Imported:
-    """Every annotation of a project; see `read_tool_labels`."""
+    """Read every annotation of a project; see `read_tool_labels`."""
     return _read(source, scans, settings, along_y=True)
 
 
 def read_cvat(source: Path, scans: Path, settings: ScanSettings) -> Imported:
-    """Every annotation of an export; see `read_tool_labels`."""
+    """Read every annotation of an export; see `read_tool_labels`."""
     return _read(source, scans, settings, along_y=False)
 
 
 def write_supervisely(frames: Sequence[ScanLabels]) -> Mapping[str, str]:
-    """Files by relative paths: a project whose datasets are the folders of the scans."""
+    """Return files by relative paths: a project whose datasets are the folders of the scans."""
     return _write(frames, along_y=True)
 
 
 def write_cvat(frames: Sequence[ScanLabels]) -> Mapping[str, str]:
-    """Files by relative paths; as a .zip CVAT takes them as annotations of a task."""
+    """Return files by relative paths; CVAT imports them in a .zip as annotations of a task."""
     return _write(frames, along_y=False)
 
 
@@ -78,10 +78,10 @@ def _read(source: Path, scans: Path, settings: ScanSettings, *, along_y: bool) -
         kinds = {entry(item, "key"): entry(item, "classTitle") for item in entry(content, "objects")}
         for figure in entry(content, "figures"):
             if entry(figure, "geometryType") != _SHAPE:
-                continue  # points and masks are no boxes
+                continue  # points and masks are not boxes
             key, geometry = entry(figure, "objectKey"), entry(figure, "geometry")
             pitch, roll, yaw = xyz(geometry, "rotation").tolist()
-            if (reason := yaw_error(yaw)) is not None:  # before a quarter is added
+            if (reason := yaw_error(yaw)) is not None:  # before the quarter turn is added
                 raise ValueError(f"a yaw {reason}")
             size = xyz(geometry, "dimensions")
             if along_y:

@@ -22,7 +22,7 @@ from asca_pillars.scans.scan_settings import ScanSettings
 
 
 def read_sustechpoints(source: Path, scans: Path, settings: ScanSettings) -> Imported:
-    """Every label file below `source`; see `read_tool_labels`."""
+    """Read every label file below `source`; see `read_tool_labels`."""
     return read_tool_labels(source, scans, settings, ".json", _parse)
 
 
@@ -45,7 +45,7 @@ def _parse(text: str) -> Iterable[ToolBox]:
 
 
 def write_sustechpoints(frames: Sequence[ScanLabels]) -> Mapping[str, str]:
-    """Files by relative paths: a scene is a folder of scans, and has label/."""
+    """Return files by relative paths: a scene is a folder of scans, and has label/."""
     identities = track_numbers(frames)
     files = {}
     for number, frame in enumerate(frames):

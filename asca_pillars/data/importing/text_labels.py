@@ -3,8 +3,8 @@
     OpenPCDet   x y z dx dy dz heading class; https://github.com/open-mmlab/OpenPCDet, docs/CUSTOM_DATASET_TUTORIAL.md
     KITTI       type truncated occluded alpha left top right bottom height width length x y z yaw [score]
 
-KITTI's labels are in the camera's frame and need a calibration. Where there is none, tools write the center of the box
-and its yaw in the LiDAR's frame into the same fields (`kitti_untransformed` of labelCloud). Radians, both.
+KITTI's labels are in the camera's frame and need a calibration. Without one, tools write the center of the box
+and its yaw in the LiDAR's frame into the same fields (`kitti_untransformed` of labelCloud). Both use radians.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -24,7 +24,7 @@ _NO_OBJECT = "DontCare"
 
 
 def read_openpcdet(source: Path, scans: Path, settings: ScanSettings) -> Imported:
-    """Every label file below `source`; see `read_tool_labels`."""
+    """Read every label file below `source`; see `read_tool_labels`."""
 
     def parse(text: str) -> Iterable[ToolBox]:
         for number, fields in _lines(text):
@@ -37,7 +37,7 @@ def read_openpcdet(source: Path, scans: Path, settings: ScanSettings) -> Importe
 
 
 def read_kitti_no_camera(source: Path, scans: Path, settings: ScanSettings) -> Imported:
-    """Every label file below `source`; see `read_tool_labels`."""
+    """Read every label file below `source`; see `read_tool_labels`."""
 
     def parse(text: str) -> Iterable[ToolBox]:
         for number, fields in _lines(text):
@@ -52,7 +52,7 @@ def read_kitti_no_camera(source: Path, scans: Path, settings: ScanSettings) -> I
 
 
 def write_openpcdet(frames: Sequence[ScanLabels]) -> Mapping[str, str]:
-    """Files by relative paths: a text for each scan."""
+    """Return files by relative paths: a text for each scan."""
 
     def line(kind: str, box: NDArray[np.float32]) -> str:
         return f"{_text(box)} {kind}"
@@ -61,7 +61,7 @@ def write_openpcdet(frames: Sequence[ScanLabels]) -> Mapping[str, str]:
 
 
 def write_kitti_no_camera(frames: Sequence[ScanLabels]) -> Mapping[str, str]:
-    """Files by relative paths: a text for each scan, with the box in the image left at 0."""
+    """Return files by relative paths: a text for each scan, with the 2D box set to 0."""
 
     def line(kind: str, box: NDArray[np.float32]) -> str:
         return f"{kind} 0 0 0 0 0 0 0 {_text(box[[5, 4, 3, 0, 1, 2, 6]])}"
@@ -85,7 +85,7 @@ def _text(values: NDArray[np.float32]) -> str:
 
 
 def _lines(text: str) -> Iterator[tuple[int, list[str]]]:
-    """Fields of each line that is not empty, with its number."""
+    """Yield the fields of each line that is not empty, with its number."""
     for number, line in enumerate(text.split("\n"), start=1):
         if fields := line.split():
             yield number, fields

@@ -1,4 +1,4 @@
-"""Common parts of the formats of labelling tools: a file for each scan, found by its name, and safe pre-labels."""
+"""Common parts of the labelling tools' formats: one file per scan, matched by name, and safe writing of pre-labels."""
 
 import hashlib
 import json
@@ -26,19 +26,19 @@ from asca_pillars.scans.find_scans import SCAN_SUFFIXES, files_below, find_scans
 from asca_pillars.scans.scan_settings import ScanSettings
 
 WRITTEN_FILE = "prelabels.json"
-"""Digests of the files that were written for labelling tools, so that corrected ones are not replaced."""
+"""Digests of the files written for labelling tools, so that corrected ones are not replaced."""
 COMMAND = "asca detect --write"
 COLORS = ("#e6194b", "#3cb44b", "#4363d8", "#f58231", "#911eb4", "#42d4f4")
-"""Colors of classes, for tools that want them stated."""
+"""Colors of classes, for tools that need them."""
 _DECIMALS = 4
-_ANGLE_DECIMALS = 8  # of angles that are converted, so that the radians come back to their last digit
+_ANGLE_DECIMALS = 8  # of converted angles, so that the radians are restored to their last digit
 _UPRIGHT_RAD = 0.01
 _TOOL_FOLDERS = {"label", "labels", "label_2", "ann", "lidar", "pointcloud", "pointclouds", "points", "velodyne", "ds0"}
-"""Folders by which tools keep scans and labels apart: they do not tell one scan from another."""
+"""Folders by which tools separate scans and labels; they do not identify a scan."""
 
 
 class ScanLabels(NamedTuple):
-    """A scan, its path below the folder of the scans without a suffix, and its boxes in the scan's own frame."""
+    """Scan, its path below the folder of scans without a suffix, and its boxes in the scan's own frame."""
 
     scan: Path
     name: Path
@@ -46,7 +46,7 @@ class ScanLabels(NamedTuple):
 
 
 class ToolBox(NamedTuple):
-    """A box as a tool states it: class, center and size (m; length, width, height), yaw, roll and pitch (rad)."""
+    """Box in a tool's terms: class, center and size (m; length, width, height), yaw, roll and pitch (rad)."""
 
     kind: Any
     center: Any
@@ -57,26 +57,26 @@ class ToolBox(NamedTuple):
 
 
 Parser: TypeAlias = Callable[[str], Iterable[ToolBox]]
-"""From the text of a file. Raises ValueError with a clause that says what is wrong and what to do."""
+"""Parser of the text of a file. Raises ValueError with a clause that states the error and the remedy."""
 
 
 def read_tool_labels(
     source: Path, scans: Path, settings: ScanSettings, suffix: str, parse: Parser, *, left: frozenset[str] = frozenset()
 ) -> Imported:
-    """Every label file below `source` with its scan, which has the same name. Scans without a file are left out.
+    """Read every label file below `source` with the scan of the same name. Scans without a file are left out.
 
     Args:
         source: a file or folder of labels.
         scans: folder of the scans.
-        settings: how the scans lie; labels are in the scans' own frame.
-        suffix: of label files.
-        parse: gives the boxes of a file.
-        left: names of files that hold no labels; nor do those that begin with an underscore.
+        settings: settings of the scans; labels are in the scans' own frame.
+        suffix: suffix of label files.
+        parse: parser of a file's boxes.
+        left: names of files without labels, in addition to those that begin with an underscore.
 
     Raises:
         ConfigError: the pose cannot be read.
         ScanError: there are no scans.
-        DatasetError: no label file, one that is not of the format, or one that belongs to no scan or to several.
+        DatasetError: no label file, one that is not of the format, or one that matches no scan or several.
     """
     dataset = dataset_settings(scans, settings)
     scan_of = _scans_by_name(Path(dataset.scans))
@@ -102,7 +102,7 @@ def read_tool_labels(
 
 
 def json_of(text: str) -> Any:
-    """The value of a JSON text; ValueError with one clause."""
+    """Parse a JSON text; ValueError with one clause."""
     try:
         return json.loads(text)
     except ValueError as error:
@@ -110,23 +110,23 @@ def json_of(text: str) -> Any:
 
 
 def xyz(row: Any, name: str, keys: Sequence[str] = ("x", "y", "z")) -> NDArray[np.float64]:
-    """Three numbers of an object in an object; ValueError if they are not there."""
+    """Return three numbers of a nested object; ValueError if they are missing."""
     vector = entry(row, name)
     return numbers([entry(vector, key) for key in keys], 3, name)
 
 
 def rounded(values: Iterable[float]) -> list[float]:
-    """Lengths and angles as they are written: with four decimals, as `asca detect` writes boxes."""
+    """Return lengths and angles with the four decimals of `asca detect`."""
     return [round(float(value), _DECIMALS) for value in values]
 
 
 def rounded_angle(angle: float) -> float:
-    """An angle that was converted, with as many decimals as it takes to find the four of the radians again."""
+    """Return a converted angle with enough decimals to restore the four of the radians."""
     return round(angle, _ANGLE_DECIMALS)
 
 
 def class_names(frames: Iterable[ScanLabels]) -> list[str]:
-    """The classes of all boxes, sorted."""
+    """Return the classes of all boxes, sorted."""
     return sorted({kind for frame in frames for kind in frame.records.types})
 
 
@@ -135,7 +135,7 @@ def write_prelabels(run_file: Path, name: str, out: Path) -> Path:
 
     Args:
         run_file: detections.jsonl of `asca detect`.
-        name: of the format.
+        name: name of the format.
         out: folder of the results.
 
     Raises:
@@ -208,12 +208,12 @@ def _records(boxes: Iterable[ToolBox], path: Path, left_out: LeftOut) -> BoxReco
         rows.append([*center, *size, box.yaw])
         tracks.append(box.track_id)
     array = np.array(rows, np.float64).reshape(-1, 7)
-    array[:, 6] = np.round(wrap_angle(array[:, 6]), _ANGLE_DECIMALS) + 0.0  # 0 and not -1e-17, or -0
+    array[:, 6] = np.round(wrap_angle(array[:, 6]), _ANGLE_DECIMALS) + 0.0  # 0 instead of -1e-17 or -0
     return records_from(array, types, None, tracks)
 
 
 def _scans_by_name(scans: Path) -> Callable[[Path, Path], Path]:
-    """A function from a label file, and its path below the folder of labels, to its scan."""
+    """Return a function from a label file, and its path below the folder of labels, to its scan."""
     by_stem: dict[str, list[Path]] = defaultdict(list)
     for scan in find_scans(scans):
         by_stem[scan.stem].append(scan)
@@ -237,9 +237,9 @@ def _scans_by_name(scans: Path) -> Callable[[Path, Path], Path]:
 
 
 def track_numbers(frames: Iterable[ScanLabels]) -> Mapping[tuple[int, int], str]:
-    """An identity for each box, by the numbers of its frame and row: that of its track, or one of its own.
+    """Return an identity for each box, by frame and row: that of its track, or a new one.
 
-    Tools want one for each object; those without a track get numbers above those of all tracks.
+    Tools need one per object; those without a track get numbers above those of all tracks.
     """
     frames = list(frames)
     stated = [track for frame in frames for track in frame.records.track_ids if track is not None]

@@ -1,7 +1,7 @@
 """Waymo's open dataset in its parquet form (v2): lidar/, lidar_box/, lidar_calibration/ with a file for each segment.
 
 Its scans are range images inside those files, so points are written: a .npy for each frame, all sensors and returns, in
-the vehicle's frame (x forward, y left, z up, z = 0 on the ground). Where lidar_pose/ and vehicle_pose/ are there too,
+the vehicle's frame (x forward, y left, z up, z = 0 on the ground). If lidar_pose/ and vehicle_pose/ are present,
 points are moved to the time of the labels. Columns: https://github.com/waymo-research/waymo-open-dataset,
 v2/perception.
 """
@@ -28,7 +28,7 @@ from asca_pillars.geometry.frame_change import is_rigid
 from asca_pillars.scans.find_scans import visible_files
 
 TOP = 1
-"""The roof's sensor."""
+"""Number of the roof's sensor."""
 TYPES = {1: "Vehicle", 2: "Pedestrian", 3: "Sign", 4: "Cyclist"}
 _TIME, _LASER = "key.frame_timestamp_micros", "key.laser_name"
 _OBJECT = "key.laser_object_id"
@@ -44,15 +44,15 @@ _VEHICLE_POSE = "[VehiclePoseComponent].world_from_vehicle.transform"
 
 
 def read_waymo(root: Path, out: Path) -> Imported:
-    """Every frame of every segment; scans are written to out/scans/<segment>/, those that are there are kept.
+    """Read every frame of every segment; scans are written to out/scans/<segment>/, existing ones are kept.
 
     Args:
         root: the folder with lidar/, lidar_box/ and lidar_calibration/ (training/ or validation/).
-        out: folder of the new dataset.
+        out: output folder of the dataset.
 
     Raises:
         DatasetError: a file is missing or not of this format.
-        OutputError: `out` holds something else.
+        OutputError: `out` has other contents.
         AscaError: pyarrow is not installed.
     """
     segments = visible_files(root / "lidar", "*.parquet")
@@ -60,7 +60,7 @@ def read_waymo(root: Path, out: Path) -> Imported:
         raise DatasetError(f"{root}: no lidar/*.parquet there; give a folder of Waymo's parquet form")
     require_own_dataset(out)
     if not (out / DATASET_FILE).exists():
-        # It marks the folder from the start, so that an import that was killed can be given again.
+        # Written first, so that an interrupted import can be repeated.
         write_text(out / DATASET_FILE, MARKER)
     scans, left_out = out.resolve() / "scans", LeftOut()
     frames: list[ImportedFrame] = []
@@ -104,7 +104,7 @@ def _write_scans(root: Path, lidar: Path, folder: Path, left_out: LeftOut) -> li
             poses = early.pop(time, None)
         try:
             points[time] += _points(row, calibrations, poses, vehicle_poses.get(time))
-        except ValueError as reason:  # a scan without one of its sensors would pass for a whole one
+        except ValueError as reason:  # a scan without one of its sensors would look complete
             left_out.add("frames", f"{lidar}, row {number}", reason)
             del missing[time], points[time]
             times.remove(time)
@@ -117,7 +117,7 @@ def _write_scans(root: Path, lidar: Path, folder: Path, left_out: LeftOut) -> li
 
 
 def _images_of_times(lidar: Path, left_out: LeftOut) -> Counter[int]:
-    """How many rows, one for each sensor, each frame of a segment has."""
+    """Return the number of rows, one for each sensor, of each frame of a segment."""
     rows: Counter[int] = Counter()
     for number, row in enumerate(parquet_rows(lidar, (_TIME,))):
         try:
@@ -133,7 +133,7 @@ def _points(
     poses: NDArray[np.float32] | None,
     world_from_vehicle: Doubles | None,
 ) -> list[NDArray[np.float32]]:
-    """Points of each return of one sensor; ValueError where they cannot be computed."""
+    """Return the points of each return of one sensor; ValueError if they cannot be computed."""
     laser = row[_LASER]
     if not isinstance(laser, int) or laser not in calibrations:
         raise ValueError(f"sensor {str(laser)[:40]} has no usable calibration")
@@ -146,7 +146,7 @@ def _points(
 
 
 def _labels(path: Path, left_out: LeftOut) -> dict[int, BoxRecords]:
-    """The boxes of each frame."""
+    """Read the boxes of each frame."""
     boxes: dict[int, list[NDArray[np.float64]]] = defaultdict(list)
     types: dict[int, list[str]] = defaultdict(list)
     objects: dict[int, list[str | None]] = defaultdict(list)
@@ -166,7 +166,7 @@ def _labels(path: Path, left_out: LeftOut) -> dict[int, BoxRecords]:
 
 
 def _calibrations(path: Path, left_out: LeftOut) -> dict[int, LidarCalibration]:
-    """Of each sensor, by its number."""
+    """Read the calibration of each sensor, by its number."""
     columns = (_LASER, _EXTRINSIC, *(f"{_INCLINATION}.{part}" for part in ("values", "min", "max")))
     found = {}
     for number, row in enumerate(parquet_rows(path, columns)):
@@ -187,7 +187,7 @@ def _calibrations(path: Path, left_out: LeftOut) -> dict[int, LidarCalibration]:
 
 
 def _rigid(values: Any, name: str) -> Doubles:
-    """A transformation (4, 4) of 16 numbers."""
+    """Return a rigid transform (4, 4) of 16 numbers."""
     matrix = numbers(values, 16, name).reshape(4, 4)
     if not is_rigid(matrix):
         raise ValueError(f"{name} is no rotation and shift")
@@ -195,7 +195,7 @@ def _rigid(values: Any, name: str) -> Doubles:
 
 
 def _vehicle_poses(path: Path, left_out: LeftOut) -> dict[int, Doubles]:
-    """(4, 4) of each frame from the vehicle to the world; empty where they were not downloaded."""
+    """Read the transform (4, 4) of each frame from the vehicle to the world; empty if it was not downloaded."""
     poses: dict[int, Doubles] = {}
     for number, row in enumerate(parquet_rows(path, (_TIME, _VEHICLE_POSE)) if path.is_file() else ()):
         try:
@@ -206,7 +206,7 @@ def _vehicle_poses(path: Path, left_out: LeftOut) -> dict[int, Doubles]:
 
 
 def _pixel_poses(path: Path, left_out: LeftOut) -> Iterator[tuple[int, NDArray[np.float32]]]:
-    """Time and (H, W, 6) of each frame, of the sensor that has them; nothing where they were not downloaded."""
+    """Yield time and poses (H, W, 6) of each frame, of the sensor that has them; nothing if not downloaded."""
     columns = (_TIME, _LASER, f"{_PIXEL_POSE}.values", f"{_PIXEL_POSE}.shape")
     for number, row in enumerate(parquet_rows(path, columns) if path.is_file() else ()):
         try:
@@ -218,12 +218,12 @@ def _pixel_poses(path: Path, left_out: LeftOut) -> Iterator[tuple[int, NDArray[n
 
 
 def _is_top(row: dict[str, Any]) -> bool:
-    laser = row[_LASER]  # perhaps an array, which has no truth value
+    laser = row[_LASER]  # may be an array, which has no truth value
     return isinstance(laser, int) and laser == TOP
 
 
 def _image(row: dict[str, Any], name: str) -> NDArray[np.float32] | None:
-    """A range image (H, W, C); None where the sensor has none, ValueError where it is damaged."""
+    """Return a range image (H, W, C); None if the sensor has none, ValueError if it is damaged."""
     values, shape = row[f"{name}.values"], row[f"{name}.shape"]
     if values is None or shape is None:
         return None

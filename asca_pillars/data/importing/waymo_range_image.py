@@ -1,7 +1,7 @@
 """Waymo's range images as points in the vehicle's frame, by the formulas of its published tools (v2, `lidar_utils`).
 
 A row is a laser, from the highest down; a column is an azimuth, the first one behind the sensor, turning clockwise. A
-pixel holds range (m), intensity, elongation and whether it lies in a no-label zone; a range of 0 is no return.
+pixel holds range (m), intensity, elongation and whether it is in a no-label zone; a range of 0 is no return.
 """
 
 from typing import NamedTuple
@@ -13,18 +13,18 @@ from asca_pillars.geometry.rotations import of_roll_pitch_yaw
 
 Doubles = NDArray[np.float64]
 _CHANNELS = 2
-"""That are read: range and intensity."""
+"""Channels used: range and intensity."""
 _FAR_M = 1000.0
-"""No sensor measures as far."""
+"""Larger ranges are invalid."""
 
 
 class LidarCalibration(NamedTuple):
-    """Of one sensor."""
+    """Calibration of one sensor."""
 
     vehicle_from_lidar: Doubles
-    """(4, 4)."""
+    """(4, 4) extrinsics."""
     inclinations_rad: Doubles | None
-    """(H,) of the lasers from the lowest up; None: evenly spaced."""
+    """(H,) elevation of the lasers from the lowest up; None: evenly spaced."""
     lowest_rad: float
     highest_rad: float
 
@@ -35,13 +35,13 @@ def range_image_points(
     pixel_poses: NDArray[np.float32] | None = None,
     world_from_vehicle: Doubles | None = None,
 ) -> NDArray[np.float32]:
-    """Points (N, 4) x, y, z in metres, vehicle's frame of the label time, and intensity squeezed into 0..1 by tanh.
+    """Return points (N, 4) x, y, z in metres, vehicle's frame at the label time, and intensity mapped to 0..1 by tanh.
 
     Args:
         image: (H, W, 4).
-        calibration: of the sensor.
+        calibration: calibration of the sensor.
         pixel_poses: (H, W, 6) roll, pitch, yaw, x, y, z of the vehicle in the world when a pixel was measured; None:
-            it stood still.
+            it did not move.
         world_from_vehicle: (4, 4) at the label time; with `pixel_poses`.
 
     Raises:

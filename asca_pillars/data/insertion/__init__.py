@@ -1,1 +1,1 @@
-"""Inserting stored objects into a training frame: GT-Aug, and RS-Aug with its free space."""
+"""Insertion of stored objects into training frames: GT-Aug, and RS-Aug with free space."""

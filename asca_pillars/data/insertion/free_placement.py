@@ -16,18 +16,18 @@ from asca_pillars.geometry.overlap import paired_bev_touch
 from asca_pillars.geometry.ranges import Ranges
 from asca_pillars.geometry.rotations import transform_columns, transform_points
 
-PLACE_TRIES = 32  # places that are tried for one object
-CHECKED_PLACES = 4  # of those on free ground, looked at closely
+PLACE_TRIES = 32  # places tried for one object
+CHECKED_PLACES = 4  # places on free ground that are fully checked
 MARGIN_M = 0.2  # around the footprint, which must be free too
 MIN_SEEN_SHARE = 0.5  # of an object's points
 
 
 class Scene:
-    """A frame while objects are inserted into it.
+    """Frame with the objects inserted so far.
 
     Attributes:
         frame: the frame before insertion.
-        obstacles: (K, 7) boxes that another one must not touch, metres and radians, LiDAR frame.
+        obstacles: (K, 7) boxes that an inserted one must not touch, metres and radians, LiDAR frame.
         inserted: inserted objects, with all their points.
     """
 
@@ -62,7 +62,7 @@ class Scene:
         return all(len(points) >= MIN_SEEN_SHARE * len(other.points) for points, other in after)
 
     def frame_with_inserted(self, min_points: int) -> LabeledFrame:
-        """The frame with the objects, without the points they hide; below `min_points` an object becomes IGNORED."""
+        """Return the frame with the objects, without occluded points; objects below `min_points` are IGNORED."""
         if not self.inserted:
             return self.frame
         boxes = np.array([item.box for item in self.inserted])
@@ -79,12 +79,12 @@ class Scene:
         )
 
     def _seen_of(self, item: StoredObject) -> Singles:
-        """Points of `item` that no inserted object hides."""
+        """Return the points of `item` that no inserted object occludes."""
         hiding = [other.box for other in self.inserted if _share_azimuths(other.box, item.box)]
         return item.points[~rays_entering(item.points, np.array(hiding))] if hiding else item.points
 
     def _seen_with(self, item: StoredObject) -> list[Singles]:
-        """Points of each inserted object that neither another one nor `item` hides."""
+        """Return the points of each inserted object that neither another one nor `item` occludes."""
         return [
             points[~rays_entering(points, item.box[None])] if _share_azimuths(other.box, item.box) else points
             for other, points in zip(self.inserted, self._seen_points, strict=True)
@@ -99,7 +99,7 @@ class Rays:
         self._reach = np.hypot(self._ends[0], self._ends[1]) * (1 + 1e-5) + 1e-3
 
     def entering(self, boxes: Floating) -> Mask:
-        """Mask (N,) of the rays that touch one of boxes (M, 7), LiDAR frame, their ends included."""
+        """Return the mask (N,) of the rays that touch one of boxes (M, 7), LiDAR frame, their ends included."""
         px, py, _ = self._ends
         hits = np.zeros(len(px), bool)
         for x, y, z, length, width, height, yaw in boxes.tolist():
@@ -129,7 +129,7 @@ def rays_entering(points: Floating, boxes: Floating) -> Mask:
 
 
 def is_clear(box: Floating, obstacles: Floating, ranges: Ranges) -> bool:
-    """Whether a box (7,) stands within the ranges and touches none of the others (K, 7), all in the LiDAR frame."""
+    """Return whether a box (7,) is within the ranges and touches none of the others (K, 7), LiDAR frame."""
     reach = (np.hypot(obstacles[:, 3], obstacles[:, 4]) + math.hypot(box[3], box[4])) / 2
     candidates = obstacles[np.hypot(obstacles[:, 0] - box[0], obstacles[:, 1] - box[1]) <= reach]
     if not ranges.hold_centers(box[None])[0]:
@@ -142,7 +142,7 @@ def is_clear(box: Floating, obstacles: Floating, ranges: Ranges) -> bool:
 def to_free_place(
     item: StoredObject, space: FreeSpace, scene: Scene, ranges: Ranges, rng: np.random.Generator
 ) -> StoredObject | None:
-    """The object turned about the sensor's vertical axis to a free place, or None if there is none."""
+    """Return the object rotated about the sensor's vertical axis to a free place, or None if there is none."""
     distance_m, azimuth_rad = math.hypot(*item.box[:2]), math.atan2(item.box[1], item.box[0])
     cells, distances_m = space.cells
     ring = np.flatnonzero(np.abs(distances_m - distance_m) < CELL_M / 2)
@@ -169,7 +169,7 @@ def to_free_place(
 
 
 def _turned(item: StoredObject, box: Singles, turn_rad: float) -> StoredObject:
-    """The object at its new box (7,), to which it was turned about the sensor's vertical axis."""
+    """Return the object at its new box (7,), rotated there about the sensor's vertical axis."""
     cos, sin = math.cos(turn_rad), math.sin(turn_rad)
     points = item.points.copy()
     transform_points(points[:, :2], np.array([[cos, -sin], [sin, cos]]), out=points[:, :2])
@@ -178,7 +178,7 @@ def _turned(item: StoredObject, box: Singles, turn_rad: float) -> StoredObject:
 
 
 def _footprint_grid(box: Floating) -> Floats:
-    """Offsets (P, 2) along and across a box (7,), all over its footprint and margin, the four corners first."""
+    """Return offsets (P, 2) along and across a box (7,), over its footprint and margin, the four corners first."""
     length, width = (float(size) + 2 * MARGIN_M for size in box[3:5])
     rows, columns = (math.ceil(size / CELL_M) + 1 for size in (length, width))
     along, across = (np.arange(rows) / (rows - 1) - 0.5) * length, (np.arange(columns) / (columns - 1) - 0.5) * width
@@ -189,14 +189,14 @@ def _footprint_grid(box: Floating) -> Floats:
 
 
 def _placed(offsets: Floats, boxes: Floating) -> Floats:
-    """Offsets (P, 2) along and across boxes (N, 7) as x, y: (N, P, 2)."""
+    """Return offsets (P, 2) along and across boxes (N, 7) as x, y: (N, P, 2)."""
     cos, sin = np.cos(boxes[:, 6, None]), np.sin(boxes[:, 6, None])
     u, v = offsets.T
     return np.stack([boxes[:, 0, None] + cos * u - sin * v, boxes[:, 1, None] + sin * u + cos * v], axis=-1)
 
 
 def _share_azimuths(a: Floating, b: Floating) -> bool:
-    """Whether boxes (7,) may stand, seen from the sensor, one before the other: by their circumscribed circles."""
+    """Return whether one of two boxes (7,) may occlude the other, by their circumscribed circles."""
     widths_rad = sum(
         math.asin(min(math.hypot(box[3], box[4]) / 2 / max(math.hypot(box[0], box[1]), 1e-6), 1.0)) for box in (a, b)
     )

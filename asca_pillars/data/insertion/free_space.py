@@ -1,9 +1,9 @@
-"""Free space for objects in a scan: seen ground minus the obstacles on it (section 3.5, steps 2 to 4).
+"""Free space for objects in a scan: visible ground minus the obstacles on it (section 3.5, steps 2 to 4).
 
-Ground that is seen: along one azimuth the beams of a spinning LiDAR land ring after ring. Between two neighboring
-landings the beam to the farther one passed low over the ground, so nothing tall stands there, although a gap of metres
-separates the returns. A gap longer than that argument carries, an obstacle in it, a step or a slope ends the free
-ground. Ground behind an obstacle is not seen and therefore not free, nor is anything beside the camera's view.
+Visible ground: along one azimuth the beams of a spinning LiDAR hit the ground ring by ring. Between two neighboring
+hits the beam to the farther one passed low over the ground, so nothing tall is there, although a gap of metres
+separates the returns. A gap too long for this, an obstacle in it, a step or a slope ends the free
+ground. Ground behind an obstacle is not visible and therefore not free, nor is anything outside the camera's view.
 """
 
 import math
@@ -33,7 +33,7 @@ from asca_pillars.geometry.common_plane import plane_heights
 
 CELL_M = 0.25
 OBSTACLE_M = (0.25, 2.5)  # heights above the ground of obstacles to a person or a car
-CLEARANCE_M = 0.3  # height above the ground at which a beam may pass and still prove it free
+CLEARANCE_M = 0.3  # largest height above the ground of a beam that shows it to be free
 MAX_SLOPE = 0.06
 _AZIMUTH_RAD = np.radians(0.4)
 _AZIMUTHS = 900
@@ -46,9 +46,9 @@ class FreeSpace:
     """Free ground of one frame, LiDAR frame, metres.
 
     Attributes:
-        ground: the fitted surface; None where no ground is seen, and nothing is free then.
+        ground: the fitted surface; None if no ground is visible, and nothing is free then.
         free: (X, Y) bool, cells of CELL_M from `ground.origin_m` on.
-        clusters: (K, 7) float32 minimum-area rectangles around the clusters, as boxes that stand on the ground.
+        clusters: (K, 7) float32 minimum-area rectangles around the clusters, as boxes on the ground.
     """
 
     ground: Ground | None
@@ -64,7 +64,7 @@ class FreeSpace:
         return xy, np.hypot(xy[0], xy[1])
 
     def is_free(self, xy_m: Floating) -> Mask:
-        """Whether the cells at (..., 2) are free: (...) bool."""
+        """Return whether the cells at (..., 2) are free: (...) bool."""
         if self.ground is None:
             return np.zeros(xy_m.shape[:-1], bool)
         index = np.floor((xy_m - self.ground.origin_m) / CELL_M).astype(np.int64)
@@ -75,7 +75,7 @@ class FreeSpace:
 
 
 def find_free_space(points: Floating) -> FreeSpace:
-    """Steps 2 to 4 on the points (N, >=3) of one scan, metres, LiDAR frame."""
+    """Compute the free space (steps 2 to 4) of the points (N, >=3) of one scan, metres, LiDAR frame."""
     nothing = FreeSpace(None, np.zeros((0, 0), bool), np.zeros((0, 7), np.float32))
     ground = fit_ground(points)
     if ground is None:
@@ -93,7 +93,7 @@ def find_free_space(points: Floating) -> FreeSpace:
     blocked = np.zeros(free.shape, np.uint8)
     rows, columns = ((standing[:2] - low) / CELL_M).astype(np.int64)
     blocked[rows, columns] = 1
-    # OpenCV's x is the second index, and integers name the middles of cells.
+    # OpenCV's x is the second index, and integers are the middles of cells.
     corners = ((footprints(clusters.astype(np.float64)) - ground.origin_m) / CELL_M - 0.5)[..., ::-1]
     for outline in np.round(corners * 16).astype(np.int32):
         cv2.fillConvexPoly(blocked, outline, 1, shift=4)
@@ -101,7 +101,7 @@ def find_free_space(points: Floating) -> FreeSpace:
 
 
 def _seen_ground(xy_m: Floats, on_ground: Mask, obstacle: Mask, ground: Ground) -> Mask:
-    """Cells (X, Y) of ground that beams landed on or passed low over, by points (2, N); see the top of the module."""
+    """Return cells (X, Y) of ground that beams hit or passed low over, for points (2, N); see the module docstring."""
     used = on_ground | obstacle
     (x, y), on_ground = np.compress(used, xy_m, axis=1), on_ground[used]
     distance = np.hypot(x, y)
@@ -118,7 +118,7 @@ def _seen_ground(xy_m: Floats, on_ground: Mask, obstacle: Mask, ground: Ground) 
     start, length = cell[:-1][joined], np.diff(cell)[joined]
     between = np.arange(length.sum()) + np.repeat(start - np.cumsum(length) + length, length)
     polar.flat[between] = True
-    # Some firings return nothing: one azimuth without returns between two with is no gap in the ground.
+    # Some firings have no return: one azimuth without returns between two with is not a gap in the ground.
     polar |= np.roll(polar, 1, axis=0) & np.roll(polar, -1, axis=0)
 
     row, column = np.round((ground.origin_m + REACH_M) / CELL_M).astype(int)
@@ -128,14 +128,14 @@ def _seen_ground(xy_m: Floats, on_ground: Mask, obstacle: Mask, ground: Ground) 
 
 @cache
 def _polar_index() -> Ints:
-    """Azimuth and ring, as one index, of each cell (X, Y) of the square that reaches REACH_M around the sensor."""
+    """Return the index of azimuth and ring of each cell (X, Y) of the square of half size REACH_M."""
     middles = np.arange(-REACH_M, REACH_M, CELL_M) + 0.5 * CELL_M
     x, y = np.meshgrid(middles, middles, indexing="ij")
     return _azimuth_bin(x, y) * _RINGS + (np.hypot(x, y) / CELL_M).astype(np.int64)
 
 
 def _is_flat(ground: Ground) -> Mask:
-    """Cells (X, Y) where the ground's slope is one that a street may have."""
+    """Return cells (X, Y) where the ground's slope is plausible for a street."""
     nodes = _nodes(ground)
     heights = plane_heights(ground.plane, nodes) + ground.rise_m.astype(np.float64)
     slopes = np.gradient(heights, LATTICE_M)
@@ -148,7 +148,7 @@ def _azimuth_bin(x_m: Floats, y_m: Floats) -> Ints:
 
 
 def _nodes(ground: Ground) -> Floats:
-    """(X, Y, 2) middles of the ground's lattice."""
+    """Return the (X, Y, 2) middles of the ground's lattice."""
     rows, columns = np.indices(ground.rise_m.shape)
     return ground.origin_m + (np.stack([rows, columns], axis=-1) + 0.5) * LATTICE_M
 
@@ -170,9 +170,9 @@ def prepare_free_spaces(split: LabeledSplit, prepared: Path, *, camera_view: boo
 
 
 def load_free_space(split: LabeledSplit, frame_id: str, prepared: Path, *, camera_view: bool) -> FreeSpace:
-    """The free space of a frame, seen from the sensor at its origin (`to_sensor`), from its file below `prepared`.
+    """Load the free space of a frame, seen from the sensor at its origin (`to_sensor`), from its file in `prepared`.
 
-    It is computed and kept there if missing or outdated.
+    It is computed and stored there if missing or outdated.
 
     Raises:
         DatasetError: the calibration cannot be read, or the folder cannot be written.
@@ -189,7 +189,7 @@ def load_free_space(split: LabeledSplit, frame_id: str, prepared: Path, *, camer
 
 
 def _stamp(split: LabeledSplit, frame_id: str) -> Ints:
-    """Numbers that change when a file that the map was made from changes."""
+    """Return numbers that change when a file that the map was computed from changes."""
     return np.array([VERSION, *split.points_state(frame_id)])
 
 
@@ -204,7 +204,7 @@ def _read(path: Path, stamp: Ints) -> FreeSpace | None:
             shape = np.array(rise.shape) * CELLS_PER_NODE
             free = np.unpackbits(file["free"], count=shape.prod()).astype(bool).reshape(shape)
             return FreeSpace(Ground(file["plane"], file["origin_m"], rise), free, clusters)
-    except (OSError, ValueError, KeyError, EOFError, BadZipFile):  # none there, or a damaged one: it is made again
+    except (OSError, ValueError, KeyError, EOFError, BadZipFile):  # missing or damaged: it is computed again
         return None
 
 

@@ -1,9 +1,9 @@
 """Ground of a scan: a plane fitted by RANSAC, and the height of the surface above it (section 3.5, step 2).
 
-The paper fits one plane and calls everything near it ground. A street has camber and kerbs, and over 70 m it follows
-its hills: one plane misses it by decimetres near and by metres far away, where an inserted object would hover or sink.
-The plane (the paper's "ground fitting parameters") is kept as the frame of reference, and on a lattice of 1 m the mean
-height of the returns above it, filled and smoothed where there are few. Ground is what lies close to that surface.
+The paper fits one plane and takes all points near it as ground. A street has camber and kerbs, and over 70 m it
+follows hills: one plane deviates by decimetres near and by metres far away, where an inserted object would float or
+sink. The plane (the paper's "ground fitting parameters") is kept as the frame of reference, with the mean height of the
+returns above it on a lattice of 1 m, filled and smoothed where there are few. Points close to that surface are ground.
 """
 
 from dataclasses import dataclass
@@ -18,9 +18,9 @@ from asca_pillars.geometry.common_plane import most_common_plane, plane_heights
 
 REACH_M = 80.0  # farther points are ignored
 LATTICE_M = 1.0
-GROUND_BAND_M = 0.15  # ground returns lie within this of the surface
+GROUND_BAND_M = 0.15  # largest distance of ground returns from the surface
 _COARSE_M = 2.0
-_OPENING_CELLS = 5  # anything that stands out and is narrower than so many coarse cells is no ground
+_OPENING_CELLS = 5  # narrower structures above the ground, in coarse cells, are removed
 _PLANE_REACH_M = 40.0
 _PLANE_BAND_M = 0.15
 _MIN_CELLS = 30
@@ -30,7 +30,7 @@ _UNKNOWN = 1e3
 
 @dataclass(frozen=True, eq=False)
 class Ground:
-    """The surface under one scan. LiDAR frame, metres.
+    """Ground surface of one scan. LiDAR frame, metres.
 
     Attributes:
         plane: (3,) float64 a, b, c of z = a x + b y + c.
@@ -43,15 +43,15 @@ class Ground:
     rise_m: NDArray[np.float16]
 
     def heights(self, xy_m: Floating) -> Floats:
-        """z (N,) of the ground at (N, 2), interpolated; beside the lattice as at its border."""
+        """Return z (N,) of the ground at (N, 2), interpolated; outside the lattice as at its border."""
         return plane_heights(self.plane, xy_m) + _interpolate(self.rise_m, self.origin_m, LATTICE_M, xy_m)
 
 
 def fit_plane(points: Floating) -> Floats | None:
-    """RANSAC plane (3,) through the ground of points (N, >=3), or None where there is none to be seen.
+    """Fit the ground plane (3,) of points (N, >=3) by RANSAC, or return None if no ground is visible.
 
-    Fed one low point per square metre within 40 m: walls and cars, most of the points, become few, and the rings near
-    the sensor no longer outvote the rest. The draws are seeded: the same points give the same plane.
+    One low point per square metre within 40 m is used: walls and cars, most of the points, become few, and the rings
+    near the sensor do not outvote the rest. The samples are seeded: the same points give the same plane.
     """
     x, y, z = np.ascontiguousarray(points[:, :3].T, np.float64)
     within = np.flatnonzero(np.hypot(x, y) < _PLANE_REACH_M)
@@ -63,15 +63,15 @@ def fit_plane(points: Floating) -> Floats | None:
 
 
 def fit_ground(points: Floating) -> Ground | None:
-    """The surface under points (N, >=3), metres, LiDAR frame, or None where no ground is to be seen."""
-    # By columns: to choose among many short rows takes ten times as long.
+    """Fit the surface under points (N, >=3), metres, LiDAR frame, or return None if no ground is visible."""
+    # By columns: selecting many short rows takes ten times as long.
     xyz = np.ascontiguousarray(points[:, :3].T, np.float64)
     xyz = np.compress((np.abs(xyz[:2]) < REACH_M).all(axis=0), xyz, axis=1)
     plane = fit_plane(xyz.T)
     if plane is None:
         return None
     above = xyz[2] - plane_heights(plane, xyz[:2].T)
-    # Hills take the ground away from the plane, the farther the more; what lies outside this wedge is none.
+    # With hills the ground deviates from the plane with distance; points outside this wedge are not ground.
     wedge = np.abs(above) < 0.4 + 0.05 * np.hypot(xyz[0], xyz[1])
     xy, above = np.compress(wedge, xyz[:2], axis=1).T, above[wedge]
     origin = np.floor(xy.min(axis=0) / _COARSE_M) * _COARSE_M
@@ -88,10 +88,10 @@ def fit_ground(points: Floating) -> Ground | None:
 
 
 def _coarse_surface(xy_m: Floating, above_m: Floating, origin_m: Floating) -> Singles:
-    """Heights above the plane on the coarse lattice, without what stands on the ground.
+    """Return heights above the plane on the coarse lattice, without objects on the ground.
 
-    The low points of the cells follow the ground except under cars and behind walls. A morphological opening tells
-    these: it cuts off what stands out and is narrower than its window, and keeps slopes.
+    The low points of the cells follow the ground except under cars and behind walls. A morphological opening removes
+    these: structures that are narrower than its window. Slopes are kept.
     """
     shape = ((xy_m - origin_m).max(axis=0) / _COARSE_M).astype(np.int64) + 1
     cells = _flat_cells(xy_m, origin_m, _COARSE_M, shape)
@@ -106,19 +106,19 @@ def _coarse_surface(xy_m: Floating, above_m: Floating, origin_m: Floating) -> Si
 
 
 def _flat_cells(xy_m: Floating, origin_m: Floating, step_m: float, shape: Ints) -> Ints:
-    """Index (N,), in a raster (X, Y) laid out row by row, of the cell that each of (N, 2) lies in."""
+    """Return the index (N,), in a raster (X, Y) in row-major order, of the cell of each of (N, 2)."""
     index = ((xy_m - origin_m) / step_m).astype(np.int64)
     return np.asarray(index[:, 0] * shape[1] + index[:, 1])
 
 
 def order_by_cell(cells: NDArray[Any], values_m: Floating) -> Ints:
-    """Order (N,) of points by the number of their cell and, within a cell, by a value, metres."""
-    # Both as one number: sorted in a sixth of the time that two take.
+    """Return the order (N,) of points by the number of their cell and, within a cell, by a value, metres."""
+    # Sorted by one combined number: a sixth of the time of sorting by two.
     return np.argsort(cells * (4 * _UNKNOWN) + np.clip(values_m, -_UNKNOWN, _UNKNOWN))
 
 
 def _low_per_cell(cells: NDArray[Any], heights_m: Floating) -> Ints:
-    """Index of the point at the tenth percentile of height in each occupied cell."""
+    """Return the index of the point at the tenth percentile of height in each occupied cell."""
     order = order_by_cell(cells, heights_m)
     first = np.flatnonzero(np.diff(cells[order], prepend=np.nan))
     count = np.diff(first, append=len(cells))
@@ -126,7 +126,7 @@ def _low_per_cell(cells: NDArray[Any], heights_m: Floating) -> Ints:
 
 
 def _smooth(values: Floating, weights: Floating, sigmas: tuple[float, ...]) -> Singles:
-    """Weighted Gaussian mean; where the narrow one finds nothing, the next wider."""
+    """Return a weighted Gaussian mean; where the narrowest kernel has no weight, that of the next wider one."""
     values, weights = values.astype(np.float32), weights.astype(np.float32)
     result = np.zeros_like(values)
     missing = np.ones(values.shape, bool)
@@ -140,7 +140,7 @@ def _smooth(values: Floating, weights: Floating, sigmas: tuple[float, ...]) -> S
 
 
 def _interpolate(lattice: NDArray[Any], origin_m: Floating, step_m: float, xy_m: Floating) -> Floats:
-    """Bilinear values (N,) at (N, 2) of a lattice of cell middles."""
+    """Return bilinear values (N,) at (N, 2) of a lattice of cell middles."""
     rows, columns = lattice.shape
     xy = np.ascontiguousarray(xy_m.T)
     place = np.clip((xy - origin_m[:, None]) / step_m - 0.5, 0, [[rows - 1], [columns - 1]])
@@ -156,19 +156,19 @@ CLUSTER_MIN_POINTS = 3
 _CELL_M = 0.25
 _REACH_CELLS = 2
 _TILE_M = 5.0
-_TILES = 1000  # more than lie side by side
+_TILES = 1000  # more than any extent has
 
 
 def cluster_boxes(obstacles: Floats, ground: Ground) -> Singles:
-    """Steps 3 and 4: DBSCAN of obstacle points (N, 3), and the minimum-area rectangle of each cluster as a box (K, 7).
+    """Cluster obstacle points (N, 3) by DBSCAN, and return each cluster's minimum-area rectangle as a box (K, 7).
 
-    Points and boxes are in metres and radians, LiDAR frame.
+    Steps 3 and 4 of section 3.5. Points and boxes are in metres and radians, LiDAR frame.
 
-    A cluster larger than any vehicle is a row of houses, hedges and parked cars; its rectangle would take the street
-    along with it, so it is cut into tiles, and each piece gets its own rectangle.
+    A cluster larger than any vehicle is a row of houses, hedges and parked cars; its rectangle would include the
+    street, so it is cut into tiles, and each tile gets its own rectangle.
     """
     labels = cluster_labels(obstacles[:, :2])
-    clustered = labels > 0  # lone points stay out here; their cells are blocked too
+    clustered = labels > 0  # noise points are left out; their cells are blocked too
     pieces = _tiled(obstacles[clustered], labels[clustered])
     rectangles = [cv2.minAreaRect(piece[:, :2].astype(np.float32)) for piece in pieces]
     boxes = np.array([(*middle, 0, *sides, 0, np.radians(angle)) for middle, sides, angle in rectangles])
@@ -181,10 +181,10 @@ def cluster_boxes(obstacles: Floats, ground: Ground) -> Singles:
 
 
 def cluster_labels(xy_m: Floats) -> Ints:
-    """DBSCAN of points (N, 2), metres: the number (N,) of each point's cluster from 1 on, 0 for a point in none.
+    """Cluster points (N, 2), metres, by DBSCAN: number (N,) of each point's cluster from 1 on, 0 for noise.
 
-    Clustered are the cells in which points lie, weighted by their number; neighbors are those up to _REACH_CELLS away
-    in x and in y. So it is done on a raster, in a fraction of the time that lists of neighbors take.
+    The occupied cells are clustered, weighted by their number of points; neighbors are those up to _REACH_CELLS away
+    in x and in y. On a raster this takes a fraction of the time of neighbor lists.
     """
     if not len(xy_m):
         return np.zeros(0, np.int64)
@@ -196,7 +196,7 @@ def cluster_labels(xy_m: Floats) -> Ints:
     around = (2 * _REACH_CELLS + 1, 2 * _REACH_CELLS + 1)
     neighbors = cv2.boxFilter(count, -1, around, normalize=False, borderType=cv2.BORDER_CONSTANT)
     core = (count > 0) & (neighbors >= CLUSTER_MIN_POINTS)
-    # Widened by one less than the reach, towards lower indices, neighbors touch and others do not.
+    # Dilated by one less than the reach, towards lower indices, neighbors touch and others do not.
     touching = cv2.dilate(core.astype(np.uint8), np.ones((_REACH_CELLS, _REACH_CELLS), np.uint8))
     _, labels = cv2.connectedComponents(touching, connectivity=8)
     # Points near a core point belong to its cluster.
@@ -205,7 +205,7 @@ def cluster_labels(xy_m: Floats) -> Ints:
 
 
 def _tiled(points: Floats, labels: Ints) -> list[Floats]:
-    """The points of each cluster, cut into squares of _TILE_M if it is longer than two of them."""
+    """Return the points of each cluster, cut into squares of _TILE_M if it is longer than two of them."""
     if not len(points):
         return []
     order = np.argsort(labels, kind="stable")

@@ -1,14 +1,14 @@
-"""The object database: every labelled object of a training list with the points inside its box (section 3.5, step 1).
+"""Object database: every labelled object of a training list with the points inside its box (section 3.5, step 1).
 
-It is built once, by as many processes as are granted, and lies beside the data:
+It is built once, by as many processes as allowed, and stored with the data:
 
-    <prepared>/objects/<list>-<key>.json   what it was built from, and how many objects of each class it holds
-                               .npy        points of all objects, one after the other: (P, 4) float32
+    <prepared>/objects/<list>-<key>.json   its inputs, and the number of objects of each class
+                               .npy        concatenated points of all objects: (P, 4) float32
                                .npz        boxes, labels, frames, first
 
-The key is a hash of the settings, of the size and time of every file read, and of what else the points depend on
-(`points_state`: dataset.yaml). Changed data therefore gets another name, and what stands under a name never changes.
-Each file appears whole, the .json last, and two processes that build at once write the same bytes. Workers map the
+The key is a hash of the settings, of size and time of every file read, and of other inputs of the points
+(`points_state`: dataset.yaml). Changed data therefore get another name, and a file's contents never change.
+Files are written atomically, the .json last, and two processes building at once write the same bytes. Workers map the
 points into memory, which they share.
 """
 
@@ -35,7 +35,7 @@ _AT_ONCE = 16
 
 
 class StoredObject(NamedTuple):
-    """One object where it stood in its own frame: box (7,) and points (N, 4) float32, LiDAR frame, and its class."""
+    """Object in its own frame: box (7,) and points (N, 4) float32, LiDAR frame, and its class."""
 
     box: NDArray[np.float32]
     label: int
@@ -43,10 +43,10 @@ class StoredObject(NamedTuple):
 
 
 class ObjectDatabase:
-    """A database on disk, read when first used; what is pickled is its path.
+    """Database on disk, read on first use; pickling stores its path.
 
-    `len` is the number M of objects, and indexing gives one of them. Objects without any point are in it too: they
-    tell how often a class occurs.
+    `len` is the number M of objects, and indexing returns one of them. Objects without points are included: they
+    count for the class frequencies.
     """
 
     def __init__(self, path: Path) -> None:
@@ -65,7 +65,7 @@ class ObjectDatabase:
 
     @property
     def boxes(self) -> NDArray[np.float32]:
-        """(M, 7), each in the LiDAR frame of its own scan."""
+        """(M, 7) boxes, each in the LiDAR frame of its own scan."""
         return self._arrays["boxes"]
 
     @property
@@ -75,7 +75,7 @@ class ObjectDatabase:
 
     @property
     def frames(self) -> NDArray[np.int64]:
-        """(M,) index, in the list, of the frame that each object comes from."""
+        """(M,) index, in the list, of the frame of each object."""
         return self._arrays["frames"]
 
     @property
@@ -96,14 +96,14 @@ class ObjectDatabase:
 def prepare_database(
     split: LabeledSplit, class_names: Sequence[str], prepared: Path, *, camera_view: bool, workers: int = 1
 ) -> ObjectDatabase:
-    """The database of a list's frames: the one on disk if nothing has changed since, else a new one.
+    """Return the database of a list's frames: the existing one if nothing has changed, else a new one.
 
     Args:
         split: the training list.
         class_names: types of the objects, labels 0, 1, ...
-        prepared: folder for what is computed once per dataset.
-        camera_view: only points that the camera sees.
-        workers: processes that read the frames; any number of them gives the same bytes.
+        prepared: folder of per-dataset caches.
+        camera_view: keep only points within the camera image.
+        workers: processes that read the frames; their number does not change the result.
 
     Raises:
         DatasetError: a frame cannot be read, or the folder cannot be written.
@@ -127,7 +127,7 @@ def _key(split: LabeledSplit, built_from: dict[str, Any]) -> str:
     digest = hashlib.sha256(json.dumps(built_from).encode())
     for frame_id in split.frame_ids:
         for path in split.input_paths(frame_id):
-            # A file that is missing is reported, in words, by whoever reads it.
+            # A missing file is reported by its reader.
             state = path.stat() if path.exists() else None
             digest.update(f"{path.name} {state and (state.st_size, state.st_mtime_ns)}\n".encode())
         with contextlib.suppress(FileNotFoundError):
@@ -136,7 +136,7 @@ def _key(split: LabeledSplit, built_from: dict[str, Any]) -> str:
 
 
 class _FrameObjects(NamedTuple):
-    """The M objects of one frame: boxes (M, 7), labels (M,), the number (M,) of points of each, and these (P, 4)."""
+    """M objects of one frame: boxes (M, 7), labels (M,), their numbers of points (M,), and these points (P, 4)."""
 
     boxes: NDArray[np.float32]
     labels: NDArray[np.int64]
@@ -156,7 +156,7 @@ def _build(path: Path, frames: Iterable[_FrameObjects], built_from: dict[str, An
     boxes, labels, counts = [np.zeros((0, 7), np.float32)], [np.zeros(0, np.int64)], [np.zeros(1, np.int64)]
     numbers = [np.zeros(0, np.int64)]
     with writing(path.with_suffix(".npy")) as temporary, temporary.open("wb") as file:
-        # Points are most of it, gigabytes of a large list: they go to the file as they come.
+        # Points are gigabytes for a large list: they are written to the file directly.
         _write_header(file, 0)
         for number, frame in enumerate(frames):
             boxes.append(frame.boxes)
@@ -184,6 +184,6 @@ def _build(path: Path, frames: Iterable[_FrameObjects], built_from: dict[str, An
 
 
 def _write_header(file: BinaryIO, points: int) -> None:
-    """The start of an .npy file of (points, 4) float32; NumPy makes it equally long for any number of points."""
+    """Write the header of an .npy file of (points, 4) float32; its length does not depend on the number of points."""
     header = {"descr": "<f4", "fortran_order": False, "shape": (points, 4)}
     np.lib.format.write_array_header_1_0(file, header)

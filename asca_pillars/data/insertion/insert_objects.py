@@ -1,16 +1,16 @@
-"""GT-Aug and RS-Aug: labelled objects of other frames are put into a training frame (section 3.5, steps 5 and 6).
+"""GT-Aug and RS-Aug: insertion of labelled objects of other frames into a training frame (section 3.5, steps 5 and 6).
 
-Both draw as many objects, of the same classes and from the same database, so that they differ in the place alone:
+Both sample as many objects, of the same classes and from the same database, so that only the places differ:
 
-- GT-Aug (SECOND): an object stays where it stood in its own frame. It must not touch a labelled object.
-- RS-Aug: an object is turned about the sensor's vertical axis to a free place. Its distance stays, and with it the
-  density of its points and the side that the sensor sees; its height follows the ground. Its footprint with a margin
-  must lie on free ground, and touch neither a labelled object nor a cluster. A place where it would hide most of
-  another object, or be hidden by one inserted before it, is not taken ("avoiding the occlusion of existing objects").
+- GT-Aug (SECOND): an object keeps its place in its own frame. It must not touch a labelled object.
+- RS-Aug: an object is rotated about the sensor's vertical axis to a free place. Its distance is kept, and with it the
+  density of its points and its visible side; its height follows the ground. Its footprint with a margin
+  must be on free ground, and touch neither a labelled object nor a cluster. Places where it would occlude most of
+  another object, or be occluded by one inserted before, are rejected ("avoiding the occlusion of existing objects").
 
-Free ground is ground that the sensor saw (`free_space`), so nothing of the scan stands between it and such an object.
-What an inserted object would hide is removed: every point whose ray enters its box on the way. The paper does not say
-so; without it, walls would shine through cars. Points of GT-Aug objects behind walls stay, as in SECOND.
+Free ground is visible to the sensor (`free_space`), so nothing in the scan occludes such an object.
+Points that an inserted object occludes are removed: every point whose ray enters its box first. The paper does not
+state it; without it, walls would be visible through cars. Points of GT-Aug objects behind walls are kept, as in SECOND.
 """
 
 from dataclasses import dataclass, replace
@@ -32,18 +32,18 @@ from asca_pillars.detection.spec import DetectorSpec
 from asca_pillars.geometry.frame_change import FrameChange
 from asca_pillars.geometry.ranges import Ranges
 
-OBJECT_TRIES = 10  # objects of a class that are tried for each insertion
+OBJECT_TRIES = 10  # objects of a class tried for each insertion
 
 
 @dataclass(frozen=True)
 class Inserter:
-    """Inserts objects into the frames of one list.
+    """Insertion of objects into the frames of one list.
 
     Attributes:
         split: the list.
         settings: number of objects and method.
-        ranges: objects are put where the detector looks.
-        camera_view: whether frames are cut to what the camera sees.
+        ranges: ranges of the detector, in which objects are placed.
+        camera_view: whether frames are cropped to the camera image.
         min_points: objects left with fewer points become IGNORED.
         prepared: folder of the free-space maps.
         database: stored objects.
@@ -66,7 +66,7 @@ class Inserter:
         return tuple(np.flatnonzero(enough & (self.database.labels == label)) for label in range(len(self.shares)))
 
     def free_space(self, frame_id: str) -> FreeSpace:
-        """Free space of a frame."""
+        """Load the free space of a frame."""
         return load_free_space(self.split, frame_id, self.prepared, camera_view=self.camera_view)
 
 
@@ -114,15 +114,15 @@ def _nothing_to_insert(split: LabeledSplit, name: str, min_points: int, objects:
 
 
 def insertion_shares(per_frame: NDArray[np.float64], wanted: NDArray[np.float64], objects: int) -> NDArray[np.float64]:
-    """Probability (C,) of each class among the inserted, so that together with what is there the counts are as wanted.
+    """Return each class's probability (C,) of insertion, by which the total counts have the wanted proportions.
 
-    A class that has more than its part already gets none; the others are filled up to one level, counted in units of
-    what is wanted: sum over classes of max(0, level * wanted - per_frame) = objects.
+    A class that has more than its part already gets none; the others are filled up to one level, in units of
+    the wanted proportions: sum over classes of max(0, level * wanted - per_frame) = objects.
 
     Args:
         per_frame: (C,) mean number of objects in a frame.
         wanted: (C,) proportions, not all 0; a class with 0 is not inserted.
-        objects: inserted into each frame.
+        objects: number inserted into each frame.
     """
     shares = np.zeros(len(wanted))
     classes = np.flatnonzero(wanted > 0)
@@ -140,15 +140,15 @@ def insertion_shares(per_frame: NDArray[np.float64], wanted: NDArray[np.float64]
 
 
 def insert_objects(frame: LabeledFrame, inserter: Inserter, rng: np.random.Generator) -> LabeledFrame:
-    """The frame with up to `settings.objects` more objects, which come last in it.
+    """Return the frame with up to `settings.objects` more objects, appended to its own.
 
-    For each, a class is drawn; where an object of it finds no place, another of the same class is tried, so that the
-    classes keep their proportions. A frame without room, or without ground, keeps fewer or none. Labelled objects that
-    an inserted one hides become IGNORED as those that the data hides.
+    For each, a class is sampled; if an object of it has no free place, another of the same class is tried, so that the
+    classes keep their proportions. A frame without free space, or without ground, gets fewer or none. Labelled objects
+    occluded by an inserted one become IGNORED, as those occluded in the data.
     """
     change = inserter.split.to_sensor
     space = inserter.free_space(frame.frame_id) if inserter.settings.method == "rs_aug" else None
-    labeled = inserter.split.labeled_boxes(frame.frame_id).boxes  # of any type: nothing is put into a lorry either
+    labeled = inserter.split.labeled_boxes(frame.frame_id).boxes  # of all types, including unlearned ones
     scene = Scene(_changed(frame, change), labeled if change.is_identity else change.boxes(labeled))
     ranges = inserter.ranges.shifted(change.shift_m)
     for label in rng.choice(len(inserter.shares), inserter.settings.objects, p=inserter.shares):

@@ -13,7 +13,7 @@ from asca_pillars.scans.find_scans import PREPARED_FILE, PREPARED_NOTE
 
 
 def prepared_folder(root: str | Path, data: DataConfig) -> Path:
-    """Folder for the dataset at `root`: <root>/prepared unless `data.prepared` names another."""
+    """Return the cache folder of the dataset at `root`: <root>/prepared unless `data.prepared` names another."""
     return Path(data.prepared) if data.prepared else Path(root) / "prepared"
 
 
@@ -24,7 +24,7 @@ def require_writable(folder: Path) -> None:
         DatasetError: it cannot be written.
         OutputError: it holds other files.
     """
-    # Proposals of earlier versions lie in a folder that has no note of its own.
+    # Caches of earlier versions have no note of their own.
     notes = (PREPARED_FILE, *(path.relative_to(folder).as_posix() for path in folder.glob(f"*/*/{PREPARED_FILE}")))
     below = [Path(at, name).relative_to(folder) for at, names, _ in os.walk(folder) for name in names]
     require_own(folder, "asca prepare", dict.fromkeys(notes, starting_with(PREPARED_NOTE)), folders=below)
@@ -34,7 +34,7 @@ def require_writable(folder: Path) -> None:
 
 @contextlib.contextmanager
 def writing(path: Path) -> Iterator[Path]:
-    """`atomic_path`, in a folder that may turn out to be read-only.
+    """Open `atomic_path`, in a folder that may be read-only.
 
     Raises:
         DatasetError: the file cannot be written.

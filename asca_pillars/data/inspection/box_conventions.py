@@ -1,4 +1,4 @@
-"""Conventions by which labels of other tools differ, and how well the points of scans fit each of them."""
+"""Conventions in which labels of other tools differ, and how well the points of scans fit each of them."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from asca_pillars.geometry.boxes import points_in_boxes
 
-_MORE = 1.1  # times as many points
+_MORE = 1.1  # ratio of points
 _SEEN_POINTS = 5  # in a box by any convention, for the box to count
 _WINS_PER_LOSS = 4
 _DEVIATIONS = 3.0
@@ -16,7 +16,7 @@ _DEVIATIONS = 3.0
 
 
 class Convention(NamedTuple):
-    """Change of boxes: yaw is multiplied and added to, z raised by a share of the height."""
+    """Change of boxes: yaw is multiplied and shifted, z shifted by a fraction of the height."""
 
     name: str
     remedy: str
@@ -50,13 +50,13 @@ CONVENTIONS = (
         heights=-0.5,
     ),
 )
-"""The first is the reference. A turn by 90 degrees is also what a swap of length and width looks like."""
+"""Conventions, the first of which is the reference. Swapped length and width look like a turn by 90 degrees."""
 
 
 class ConventionFit(NamedTuple):
     """Fit of a convention to M boxes.
 
-    `points` in all boxes together; boxes with 10 % `more` points than as labelled, and those with as many `fewer`.
+    `points` in all boxes together; boxes with 10 % `more` points than as labelled, and those with 10 % `fewer`.
     """
 
     name: str
@@ -76,7 +76,7 @@ def count_points(points: NDArray[np.float32], boxes: NDArray[np.float32]) -> NDA
 
 
 def convention_fits(counts: NDArray[np.int64]) -> tuple[ConventionFit, ...]:
-    """The fit of each convention to boxes with these numbers of points, (C, M) unitless, of `count_points`."""
+    """Return the fit of each convention to boxes with these numbers of points, (C, M) of `count_points`."""
     seen = counts[:, counts.max(axis=0, initial=0) >= _SEEN_POINTS]
     more, fewer = seen > _MORE * seen[0], seen[0] > _MORE * seen
     rows = zip(CONVENTIONS, counts.sum(axis=1), more.sum(axis=1), fewer.sum(axis=1), strict=True)
@@ -84,7 +84,7 @@ def convention_fits(counts: NDArray[np.int64]) -> tuple[ConventionFit, ...]:
 
 
 def better_convention(fits: Sequence[ConventionFit]) -> tuple[Convention, ConventionFit] | None:
-    """The best convention that fits significantly better than that of the labels; None if none does."""
+    """Return the best convention that fits significantly better than that of the labels; None if none does."""
     better = [
         (convention, fit)
         for convention, fit in zip(CONVENTIONS, fits, strict=True)
@@ -94,7 +94,7 @@ def better_convention(fits: Sequence[ConventionFit]) -> tuple[Convention, Conven
 
 
 def _changed(box: NDArray[np.float32]) -> NDArray[np.float32]:
-    """The box (7,) by each convention: (C, 7)."""
+    """Return the box (7,) in each convention: (C, 7)."""
     boxes = np.repeat(box[None], len(CONVENTIONS), axis=0)
     for row, convention in zip(boxes, CONVENTIONS, strict=True):
         row[6] = convention.yaw_sign * box[6] + convention.yaw_rad

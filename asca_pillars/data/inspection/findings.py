@@ -10,7 +10,7 @@ from asca_pillars.data.inspection.inspect_dataset import ClassFacts, Inspection,
 from asca_pillars.data.inspection.measurements import InspectedSpec, input_cells
 from asca_pillars.scans.input_check import TOLERANCE_M
 
-# Beyond these shares something is a mistake or costs recall; KITTI and the simulator stay well below all of them.
+# Larger shares indicate an error or cost recall; KITTI and the simulator are well below all of them.
 BOXES_OUTSIDE = 0.05
 BOXES_CUT_IN_Z = 0.1
 BOXES_WITHOUT_POINTS = 0.2
@@ -18,17 +18,17 @@ BOXES_WITH_FEW_POINTS = 0.3
 BOXES_MISFIT = 0.25
 BOXES_FORCED = 0.6
 BOXES_MISSED = 0.02
-POINTS_OUTSIDE = 0.75  # a grid that looks forward loses half of what a sensor sees in a full turn
+POINTS_OUTSIDE = 0.75  # a grid ahead of the sensor excludes half of a revolution
 POINTS_CUT = 0.2
 SCANS_OVER_MAX_CELLS = 0.05
-REFLECTANCES_CUT = 0.001  # fewer are specks and retroreflectors
-ODD_SCANS = 0.5  # single scans of other sensors look turned: on wide streets and at crossings
-FEWEST_BOXES = 10  # with fewer a share or a mean says nothing
+REFLECTANCES_CUT = 0.001  # fewer are noise and retroreflectors
+ODD_SCANS = 0.5  # single scans may look turned, on wide streets and at crossings
+FEWEST_BOXES = 10  # too few for a share or a mean
 DIM_REFLECTANCE = 0.1  # the brightest point of all scans; the reflectance was scaled down twice
 
 
 class Finding(NamedTuple):
-    """`error`: training would be in vain. `about` names the class or the part, `text` is one line with the remedy."""
+    """Problem of a dataset. `error`: training cannot succeed. `about`: class or part, `text`: one line with remedy."""
 
     level: Literal["error", "warning"]
     about: str
@@ -36,7 +36,7 @@ class Finding(NamedTuple):
 
 
 def findings(inspection: Inspection, spec: InspectedSpec, min_points: int) -> list[Finding]:
-    """Errors first: frames that cannot be read, classes without positives; then whatever else looks wrong.
+    """Return the problems, errors first: unreadable frames, classes without positives; then other problems.
 
     Args:
         inspection: measurements of the dataset.
@@ -237,7 +237,7 @@ def _of_points(scans: ScanFacts, frames: int, spec: InspectedSpec) -> Iterator[s
 
 
 def _widen(facts: ClassFacts, spec: InspectedSpec) -> str:
-    """Extent of the boxes along x, y or both, beside the range that does not hold them."""
+    """Return the extent of the boxes along x, y or both, with the range that does not contain them."""
     assert facts.reach_m is not None, "there are boxes"
     ranges = (spec.grid.x_range_m, spec.grid.y_range_m)
     wrong = [

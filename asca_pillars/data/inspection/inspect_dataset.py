@@ -1,4 +1,4 @@
-"""Measures a dataset against a configuration before training.
+"""Measurement of a dataset against a configuration before training.
 
 `measurements` measures a frame, this module a dataset, and `findings` lists its problems.
 """
@@ -33,7 +33,7 @@ from asca_pillars.scans.input_check import AxesWarning
 
 
 class Spread(NamedTuple):
-    """Percentiles of a quantity: 10 % of the values lie below `p10`, 10 % above `p90`."""
+    """Percentiles of a quantity: 10 % of the values are below `p10`, 10 % above `p90`."""
 
     p10: float
     median: float
@@ -43,18 +43,18 @@ class Spread(NamedTuple):
 
 @dataclass(frozen=True)
 class ClassFacts:
-    """The labelled objects of one class.
+    """Measurements of the labelled objects of one class.
 
     Attributes:
         boxes: number of boxes. Without any, their measurements are None.
         points: points inside one box; `no_points` boxes have none, `few_points` fewer than data.min_points.
         size_m: mean length, width and height; `size_std_m` their standard deviations.
-        misfits: boxes that no anchor can overlap by positive_iou, wherever it stands: the size is too different.
+        misfits: boxes that no anchor can overlap by positive_iou at any position: the size is too different.
         z_m: mean z of the centers, LiDAR frame.
         reach_m: lowest and highest x, y and z of the centers.
-        outside_xyz: boxes whose center lies outside the grid's range of x, of y, of z.
-        cut_in_z: boxes whose top or bottom reaches beyond the range of z.
-        overlapped, forced, missed: boxes by their `MatchOutcome`; together those that training is to find.
+        outside_xyz: boxes whose center is outside the grid's range of x, of y, of z.
+        cut_in_z: boxes whose top or bottom is outside the range of z.
+        overlapped, forced, missed: boxes by their `MatchOutcome`; together the targets of training.
         positives: positive anchors.
     """
 
@@ -80,24 +80,24 @@ class ClassFacts:
 
 @dataclass(frozen=True)
 class ScanFacts:
-    """The scans, and their pillars or voxels before any limit.
+    """Measurements of the scans, and of their pillars or voxels before any limit.
 
     Attributes:
-        points: points of a scan that training sees.
-        dropped_points: stored points with a value that is not finite, `scans_with_dropped` the scans that have any.
-        scans_without_points: those with no point inside the grid.
-        outside_share: share of the points seen that lie outside the grid.
+        points: points of a scan in training.
+        dropped_points: stored points with a value that is not finite, `scans_with_dropped` the scans with any.
+        scans_without_points: scans without a point inside the grid.
+        outside_share: fraction of the points in training outside the grid.
         reflectance_stored: lowest and highest in the files.
-        reflectance_scales: what reading divides stored reflectances by, and the number of scans of each.
-        above_scale_share: mean share of a scan's points whose reflectance exceeds it and is cut off.
+        reflectance_scales: divisors of stored reflectances, and the number of scans of each.
+        above_scale_share: mean fraction of a scan's points whose reflectance exceeds the scale and is clipped.
         reflectance: mean reflectance of a scan, in 0..1.
-        ground_z_m: height of the ground near the sensor; None where no scan shows it.
+        ground_z_m: height of the ground near the sensor; None if it is visible in no scan.
         anchor_bottoms_m: lowest and highest bottom of the classes' anchors.
         cell: `pillar` or `voxel`.
-        cells: of a scan; `scans_over_max_cells` have more than the detector takes.
-        fullest_cell: most points of any cell.
-        crowded_share: share of the cells with more than max_points.
-        cut_share: share of the points inside the grid that max_points takes away.
+        cells: of a scan; `scans_over_max_cells` have more than the detector's limit.
+        fullest_cell: most points in any cell.
+        crowded_share: fraction of the cells with more than max_points.
+        cut_share: fraction of the points inside the grid that are dropped by max_points.
     """
 
     points: Spread
@@ -123,11 +123,11 @@ class ScanFacts:
 class Inspection:
     """Measurements of `frames` of a split's frames.
 
-    `types` counts the labels by type, those of no class included; `damaged` holds a line for each frame that was
-    selected and cannot be read, `axes_warnings` a warning for each scan whose axes look wrong. A
-    dataset of KITTI's layout cannot state how its sensor stands (`states_mounting`). `conventions` says how well the
-    points fit the boxes of the classes as they are labelled, turned, mirrored, raised and lowered; `yaws_doubt` is a
-    sentence where the yaws do not look like radians.
+    `types` counts the labels by type, including types of no class; `damaged` has a line for each selected frame that
+    cannot be read, `axes_warnings` a warning for each scan whose axes look wrong. A
+    dataset of KITTI's layout cannot state its mounting (`states_mounting`). `conventions` states how well the
+    points fit the boxes of the classes as labelled, turned, mirrored, raised and lowered; `yaws_doubt` is a
+    sentence if the yaws do not look like radians.
     """
 
     data: str
@@ -270,7 +270,7 @@ def _scan_facts(scans: Sequence[ScanMeasure], spec: InspectedSpec) -> ScanFacts:
 
 
 def spread(values: NDArray[np.number]) -> Spread | None:
-    """The percentiles of values (N,) of any unit; None without any."""
+    """Return the percentiles of values (N,) of any unit; None without any."""
     return _some(values) if len(values) else None
 
 

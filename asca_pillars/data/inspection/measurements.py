@@ -1,4 +1,4 @@
-"""One labelled frame, measured as training sees it: by the functions that the training loader calls."""
+"""Measurements of one labelled frame as in training, computed with the functions of the training loader."""
 
 from collections import Counter
 from collections.abc import Callable
@@ -33,7 +33,7 @@ class InputCells:
     Attributes:
         name: name of one cell.
         of_points: finite points (N, >=3), metres, LiDAR frame -> flat index of each one's cell (N,), -1 outside.
-        max_points: points of a cell that the network sees.
+        max_points: points of a cell that the network uses.
         max_points_key: key of `max_points` in the configuration.
         max_cells: limit of cells in a scan; None without one.
         closer_anchors: advice for a denser grid of anchors.
@@ -48,7 +48,7 @@ class InputCells:
 
 
 def input_cells(spec: InspectedSpec) -> InputCells:
-    """Cells of this detector's input."""
+    """Return the cells of this detector's input."""
     if isinstance(spec, PillarSpec):
         return InputCells(
             name="pillar",
@@ -70,28 +70,28 @@ def input_cells(spec: InspectedSpec) -> InputCells:
 
 
 DOUBT_POINTS = 8_192
-"""Points of a scan that its axes are checked by."""
+"""Points of a scan for the check of its axes."""
 
 
 class MatchOutcome(IntEnum):
     """Assignment of anchors to a labelled object."""
 
     LEFT_OUT = 0
-    """It has too few points, or its center lies outside the grid."""
+    """It has too few points, or its center is outside the grid."""
     OVERLAPPED = 1
     """A positive anchor overlaps it by positive_iou; with the assigner `atss`, at all."""
     FORCED = 2
-    """No anchor does; the nearest ones are matched to it nevertheless, and fit it badly."""
+    """No anchor overlaps it by that; the nearest ones are matched to it nevertheless, and fit poorly."""
     MISSED = 3
     """It has no positive anchor."""
 
 
 class ScanMeasure(NamedTuple):
-    """A scan as its file has it (stored) and as training sees it, and its pillars or voxels before any limit.
+    """Scan as stored and as in training, and its pillars or voxels before any limit.
 
-    `inside` counts the points seen inside the grid, `reflectance` is the mean over those seen, in 0..1. Reading divides
-    the stored ones by `reflectance_scale`; the share `above_scale` of them is then cut off. `ground_z_m` is NaN where
-    the ground near the sensor cannot be seen. `crowded` cells have more than max_points, which takes `cut` points away.
+    `inside` counts the points inside the grid, `reflectance` is their mean in training, in 0..1. Stored reflectances
+    are divided by `reflectance_scale`; the fraction `above_scale` is then clipped. `ground_z_m` is NaN if
+    the ground near the sensor is not visible. `crowded` cells have more than max_points, which drops `cut` points.
     """
 
     points: int
@@ -110,11 +110,11 @@ class ScanMeasure(NamedTuple):
 
 
 class FrameMeasure(NamedTuple):
-    """A frame: its labels by type, the M objects of the C classes, and its scan.
+    """Measurements of a frame: its labels by type, the M objects of the C classes, and its scan.
 
     `boxes` (M, 7), `labels` (M,) class index, `points` (M,) inside each box, `outcomes` (M,), `positives` (C,) positive
     anchors of each class, `axes` a warning about the scan's axes, `convention_points` (C, M) inside each box by each
-    of the `box_conventions`, `label_yaws` as the labels state them.
+    of the `box_conventions`, `label_yaws` as labelled.
     """
 
     types: Counter[str]
@@ -137,7 +137,7 @@ def measure_frame(
     Raises:
         DatasetError, ScanError: a damaged file, see `read_frame`.
     """
-    # min_points=0: objects that training ignores for their few points are to be counted by class, too.
+    # min_points=0: objects that training ignores for their few points are counted by class, too.
     frame = read_frame(split, frame_id, spec.class_names, camera_view=data.camera_view, min_points=0)
     points = points_in_boxes(frame.points, frame.boxes).sum(axis=0)
     to_find = replace(frame, labels=np.where(points < data.min_points, IGNORED, frame.labels))
@@ -164,8 +164,8 @@ def measure_frame(
 def match(
     frame: LabeledFrame, spec: InspectedSpec, assigner: Assigner = "overlap"
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """The `MatchOutcome` of each box (M,), and counts (C,) of the positive anchors of each class."""
-    # Rows in the place of the labels tell which boxes the grid holds.
+    """Return the `MatchOutcome` of each box (M,), and counts (C,) of the positive anchors of each class."""
+    # Rows in place of the labels show which boxes are inside the grid.
     kept = within_ranges(replace(frame, labels=np.arange(len(frame.boxes))), spec.ranges).labels
     boxes, labels = frame.boxes[kept], frame.labels[kept]
     targets = assign_targets(spec.anchors, spec.classes, boxes, labels, assigner)

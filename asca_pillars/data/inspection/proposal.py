@@ -1,4 +1,4 @@
-"""A configuration measured on a dataset: classes with their anchors and thresholds, and the ranges that hold them."""
+"""Configuration fitted to a dataset: classes with their anchors and thresholds, and ranges."""
 
 import math
 from collections.abc import Sequence
@@ -25,18 +25,18 @@ from asca_pillars.ops.pillar.grid import NECK_STRIDE
 from asca_pillars.ops.pillar.spec import PillarSpec
 from asca_pillars.ops.pv_rcnn.spec import MAP_MULTIPLE
 
-HELD = 0.98  # share of the boxes that each range has to hold
-MATCHED = 0.6  # share of the boxes that an anchor should overlap by positive_iou; the best positive_iou that gives it
+HELD = 0.98  # share of the boxes that each range has to contain
+MATCHED = 0.6  # share of the boxes that an anchor should overlap by positive_iou; the best positive_iou with that share
 POSITIVE_IOUS = (0.6, 0.55, 0.5, 0.45, 0.4, 0.35, 0.3)
 NEGATIVE_BELOW = 0.15  # negative_iou below positive_iou, as for KITTI's classes
-BEHIND_M = -5.0  # boxes beyond this need a grid that looks back
+BEHIND_M = -5.0  # boxes further behind need a grid that extends behind the sensor
 FINDABLE_POINTS = 5  # ranges are those of the boxes with so many: far ones with fewer would make the grid huge
-SPARE_PILLARS = 1.1  # room above the fullest scan
+SPARE_PILLARS = 1.1  # margin above the scan with the most pillars
 _TENTH_M = 0.1
 
 
 class Proposal(NamedTuple):
-    """The configuration, and the number of boxes per class; `rare` types have too few for a class."""
+    """Configuration, and the number of boxes per class; `rare` types have too few for a class."""
 
     config: Config
     boxes: dict[str, int]
@@ -44,9 +44,9 @@ class Proposal(NamedTuple):
 
 
 def propose(split: LabeledSplit, config: Config, *, frames: int = 500, progress: bool = False) -> Proposal:
-    """`config` with every labelled type of FEWEST_BOXES or more visible boxes as a class, and a grid that holds them.
+    """Return `config` with each type of FEWEST_BOXES or more visible boxes as a class, and a grid that contains them.
 
-    An anchor has the median size and height of its boxes. A range of the grid stays as it is if it holds HELD of them.
+    An anchor has the median size and height of its boxes. A range of the grid is kept if it contains HELD of them.
 
     Args:
         split: the labels.
@@ -100,7 +100,7 @@ def propose(split: LabeledSplit, config: Config, *, frames: int = 500, progress:
 
 
 def differences(config: Config) -> dict[str, Any]:
-    """Settings of a configuration that differ from the defaults, as plain values for a YAML."""
+    """Return the settings of a configuration that differ from the defaults, as plain values for a YAML."""
     plain = _differences(config, to_dict(config))
     if config.model.kind != Config().model.kind:
         plain["model"] = {"kind": config.model.kind} | plain["model"]
@@ -108,7 +108,7 @@ def differences(config: Config) -> dict[str, Any]:
 
 
 def _differences(settings: Any, plain: dict[str, Any]) -> dict[str, Any]:
-    """Fields of a dataclass that differ from the defaults; a changed section is compared with those of its own type."""
+    """Return the fields of a dataclass that differ from the defaults of its own type, recursively."""
     default, changed = type(settings)(), {}
     for key, value in plain.items():
         changed_value = getattr(settings, key)
@@ -118,13 +118,13 @@ def _differences(settings: Any, plain: dict[str, Any]) -> dict[str, Any]:
 
 
 def _holding(spec: InspectedSpec, boxes: Floats) -> InspectedSpec:
-    """The same with a grid of the same cells whose ranges hold the boxes (N, 7)."""
+    """Return the spec with a grid of the same cells whose ranges contain the boxes (N, 7)."""
     grid, outside, changes = spec.grid, (1 - HELD) / 2, dict[str, Any]()
     looks_back = np.quantile(boxes[:, 0], outside) < min(BEHIND_M, grid.x_range_m[0])
     if isinstance(spec, PillarSpec):
         depth_m, width_m, height_m = spec.grid.zones * spec.grid.v_max_m, spec.grid.v_y_m, _TENTH_M
         if looks_back:
-            # Zones grow coarser ahead of the sensor; a view all around needs pillars of one depth.
+            # Zones grow coarser ahead of the sensor; a view of every direction needs pillars of one depth.
             changes, depth_m = {"zones": 1, "v_max_m": width_m}, width_m
         steps_m = NECK_STRIDE * depth_m, NECK_STRIDE * width_m
     else:
@@ -136,15 +136,15 @@ def _holding(spec: InspectedSpec, boxes: Floats) -> InspectedSpec:
     low = np.quantile(boxes[:, 2] - boxes[:, 5] / 2, outside)
     high = np.quantile(boxes[:, 2] + boxes[:, 5] / 2, 1 - outside)
     if not (grid.z_range_m[0] <= low and high <= grid.z_range_m[1]):
-        margin_m = 0.5  # the ground below, and what is a little higher
+        margin_m = 0.5  # for the ground below, and what is slightly higher
         changes["z_range_m"] = tuple(height_m * round(end / height_m) for end in (low - margin_m, high + margin_m))
-    # Rounded, for people who read them in a YAML.
+    # Rounded for readability in a YAML.
     ranges = {key: tuple(round(float(end), 6) for end in changes[key]) for key in changes if key.endswith("range_m")}
     return replace(spec, grid=replace(grid, **(changes | ranges)))  # type: ignore[arg-type]  # its own grid
 
 
 def _around(span_m: tuple[float, float], centers: Floats, outside: float, step_m: float) -> tuple[float, float]:
-    """Like `_widened`, the same ahead and behind."""
+    """Return a range as `_widened`, symmetric ahead and behind."""
     if span_m[0] == -span_m[1] and _widened(span_m, centers, outside, step_m) == span_m:
         half = math.ceil(round(2 * span_m[1] / step_m, 6)) * step_m / 2  # whole steps, which may have changed
         return -half, half
@@ -174,7 +174,7 @@ def _class(name: str, boxes: Floats, spec: InspectedSpec) -> ClassSpec:
 
 
 def _best_overlaps(boxes: Floats, size_m: Sequence[float], spec: InspectedSpec) -> Floats:
-    """(N,) overlap of each box with the better one of the anchors of the cell that is nearest to it."""
+    """Return the overlap (N,) of each box with the better one of the anchors of its nearest cell."""
     x_m, y_m = spec.anchor_centers_m()
     best = np.zeros(len(boxes))
     for row, box in enumerate(boxes):

@@ -1,4 +1,4 @@
-"""KITTI's files: the one import for layout, calibrations and labels."""
+"""KITTI's layout, calibrations and labels."""
 
 from asca_pillars.data.kitti.calibration import (
     DEFAULT_IMAGE_SIZE_WH,

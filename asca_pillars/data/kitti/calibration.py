@@ -1,4 +1,4 @@
-"""KITTI's calibration: from the LiDAR to the rectified camera and on to the left color image.
+"""KITTI's calibration: from the LiDAR to the rectified camera and to the left color image.
 
 Frames: LiDAR x forward, y left, z up. Rectified camera x right, y down, z forward. Both in metres.
 """
@@ -19,12 +19,12 @@ from asca_pillars.geometry.rotations import transform_columns
 
 DEFAULT_IMAGE_SIZE_WH = (1242, 375)
 NEAR_PLANE_M = 0.1
-"""Points nearer to the image plane than this count as behind the camera: their pixels would be meaningless."""
+"""Smallest depth of visible points: pixels of nearer ones would be meaningless."""
 
 BOX_EDGES = np.array([(0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (0, 4), (1, 5), (2, 6), (3, 7)])
-"""The twelve edges of a box as pairs of rows of `geometry.boxes.corners`."""
+"""Twelve edges of a box as pairs of rows of `geometry.boxes.corners`."""
 
-# The file's key, the tracking benchmark's spelling of it, and the shape of its matrix.
+# Key in the file, key in the tracking benchmark, and shape of the matrix.
 _KEYS = (
     ("P2", "P2", (3, 4)),
     ("R0_rect", "R_rect", (3, 3)),
@@ -34,7 +34,7 @@ _KEYS = (
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """One frame's calibration, float64.
+    """Calibration of one frame, float64.
 
     `p2` (3, 4) projects the rectified camera frame to pixels of the left color image, `r0_rect` (3, 3)
     rectifies the reference camera, `camera_from_lidar` (3, 4) is KITTI's Tr_velo_to_cam.
@@ -53,15 +53,15 @@ class Calibration:
 
     @cached_property
     def lidar_from_rect_matrix(self) -> NDArray[np.float64]:
-        """(4, 4), LiDAR from rectified camera: exactly inverse; printed rotations are orthonormal to 7 digits only."""
+        """(4, 4), LiDAR from rectified camera: the true inverse; stored rotations are orthonormal to 7 digits only."""
         return np.linalg.inv(self.rect_from_lidar_matrix).astype(np.float64)
 
     def rect_from_lidar(self, points_xyz: NDArray[np.floating]) -> NDArray[np.float64]:
-        """(..., 3) LiDAR metres to (..., 3) metres in the rectified camera frame."""
+        """Transform (..., 3) LiDAR metres to (..., 3) metres in the rectified camera frame."""
         return _transform(self.rect_from_lidar_matrix, points_xyz)
 
     def lidar_from_rect(self, points_xyz: NDArray[np.floating]) -> NDArray[np.float64]:
-        """(..., 3) metres in the rectified camera frame to (..., 3) LiDAR metres."""
+        """Transform (..., 3) metres in the rectified camera frame to (..., 3) LiDAR metres."""
         return _transform(self.lidar_from_rect_matrix, points_xyz)
 
     def project(self, points_lidar: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -80,11 +80,11 @@ def in_image(
     calib: Calibration,
     image_size_wh: Sequence[int] = DEFAULT_IMAGE_SIZE_WH,
 ) -> NDArray[np.bool_]:
-    """Mask (...) of the LiDAR points (..., >=3) before the camera that project into the image.
+    """Return the mask (...) of the LiDAR points (..., >=3) in front of the camera that project into the image.
 
-    KITTI labels only what the camera sees, so training points are cropped to this view.
+    KITTI labels only the camera's field of view, so training points are cropped to it.
     """
-    # Coordinates by rows, and sums in place: several times faster than many short rows and new memory for each step.
+    # Coordinates as rows, and sums in place: several times faster than short rows and temporary arrays.
     xyz = np.ascontiguousarray(points_lidar[..., :3].reshape(-1, 3).T, np.float64)
     rect = transform_columns(xyz, calib.rect_from_lidar_matrix[:3, :3], calib.rect_from_lidar_matrix[:3, 3])
     image = transform_columns(rect, calib.p2[:, :3], calib.p2[:, 3])
@@ -96,9 +96,9 @@ def in_image(
 
 
 def project_edges(boxes: NDArray[np.floating], calib: Calibration) -> NDArray[np.float64]:
-    """The edges of LiDAR boxes (N, 7) in the image: (N, 12, 2, 2) = box, edge (`BOX_EDGES`), end, pixel.
+    """Project the edges of LiDAR boxes (N, 7) to the image: (N, 12, 2, 2) = box, edge (`BOX_EDGES`), end, pixel.
 
-    Edges that pass the near plane are cut there; those wholly behind it are NaN.
+    Edges that cross the near plane are cut there; those behind it are NaN.
     """
     # The depth before the image plane is P2's third row: edges are cut after P2, before the division.
     image = _transform(calib.p2, calib.rect_from_lidar(corners(boxes).astype(np.float64)))
@@ -119,7 +119,7 @@ def image_boxes(
     calib: Calibration,
     image_size_wh: Sequence[int] = DEFAULT_IMAGE_SIZE_WH,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The 2D boxes around LiDAR boxes (N, 7): pixels (N, 4) x1, y1, x2, y2 and the truncation (N,) in 0..1.
+    """Return the 2D boxes of LiDAR boxes (N, 7): pixels (N, 4) x1, y1, x2, y2 and the truncation (N,) in 0..1.
 
     Pixels are clipped to the image as KITTI does, to 0 .. width-1 and 0 .. height-1; truncation is the share
     of the unclipped rectangle that was cut away. A box behind the camera or beside the image gets
@@ -131,7 +131,7 @@ def image_boxes(
     high = np.where(behind[..., None], -np.inf, ends).max(axis=1, initial=-np.inf)
     limit = np.asarray(image_size_wh) - 1.0
     outside = ((high <= 0) | (low >= limit)).any(axis=1)
-    # Boxes outside are given any finite rectangle, so that the arithmetic below stays free of infinities.
+    # Boxes outside get any finite rectangle, so that the arithmetic below has no infinities.
     low, high = np.where(outside[:, None], 0.0, low), np.where(outside[:, None], 1.0, high)
     clipped_low, clipped_high = np.clip(low, 0, limit), np.clip(high, 0, limit)
     area = np.maximum((high - low).prod(axis=1), 1e-9)
@@ -155,7 +155,7 @@ def read_calibration(path: str | Path) -> Calibration:
     lines = {words[0].rstrip(":"): words[1:] for line in text.splitlines() if (words := line.split())}
     matrices = [_matrix(path, lines, *key) for key in _KEYS]
     for (key, _, _), matrix in list(zip(_KEYS, matrices, strict=True))[1:]:
-        # Without this an all-zero matrix, as some converters write it, would surface as NaN boxes much later.
+        # An all-zero matrix, as some converters write it, would otherwise cause NaN boxes later.
         if np.abs(matrix[:, :3] @ matrix[:, :3].T - np.eye(3)).max() > 0.01:
             raise DatasetError(f"{path}: {key} is not a rotation; restore the file")
     if not abs(np.linalg.det(matrices[0][:, :3])) > 0:

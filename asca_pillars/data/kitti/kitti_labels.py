@@ -1,4 +1,4 @@
-"""KITTI's label files, and their camera-frame boxes as LiDAR boxes.
+"""KITTI's label files, and conversion of their camera-frame boxes to and from LiDAR boxes.
 
 A KITTI label gives an upright box in the rectified camera frame: height, width, length, the *bottom* center
 x, y, z (x right, y down, z forward) and rotation_y about the y axis, 0 when the object faces x. Such boxes
@@ -20,12 +20,12 @@ from asca_pillars.data.kitti.calibration import DEFAULT_IMAGE_SIZE_WH, Calibrati
 from asca_pillars.data.yaw_units import yaw_error
 from asca_pillars.geometry.boxes import wrap_angle
 
-_TOO_LARGE = 1e9  # of any field; far above, float32 boxes are no longer finite
+_TOO_LARGE = 1e9  # of any field; float32 boxes of larger numbers are not finite
 
 
 @dataclass(frozen=True)
 class KittiObject:
-    """One line of a label file: pixels in the left color image, metres and radians in the rectified camera.
+    """Object of a label file: pixels in the left color image, metres and radians in the rectified camera.
 
     `truncated` 0..1 and `occluded` 0..3 are -1 where unknown, `alpha` is the observation angle, `bbox` is
     x1, y1, x2, y2, and `score` is None in ground truth. DontCare areas have only a `bbox`; sizes are -1.
@@ -47,12 +47,12 @@ class KittiObject:
 
     @property
     def has_box_3d(self) -> bool:
-        """False for DontCare areas and for 2D detections, whose sizes are -1."""
+        """Whether there is a 3D box: not for DontCare areas and 2D detections, whose sizes are -1."""
         return self.type != "DontCare" and min(self.height_m, self.width_m, self.length_m) > 0
 
 
 def objects_3d(objects: Iterable[KittiObject]) -> list[KittiObject]:
-    """Those objects that have a 3D box, in order."""
+    """Return the objects that have a 3D box, in order."""
     return [item for item in objects if item.has_box_3d]
 
 
@@ -81,18 +81,18 @@ def write_labels(path: str | Path, objects: Iterable[KittiObject]) -> None:
 
 
 def labels_text(objects: Iterable[KittiObject]) -> str:
-    """The text of a label or detection file, a line for each object; what `write_labels` writes."""
+    """Return the text of a label or detection file, one line per object, as `write_labels` writes it."""
     return "".join(_format_object(item) + "\n" for item in objects)
 
 
 def boxes_from_objects(objects: Sequence[KittiObject], calib: Calibration) -> NDArray[np.float32]:
-    """The LiDAR boxes (N, 7) of labelled objects.
+    """Return the LiDAR boxes (N, 7) of labelled objects.
 
-    Center and heading go through the frame's own calibration. The LiDAR is turned against the camera by up
-    to a degree, so yaw is not merely -rotation_y - pi/2.
+    Center and yaw are transformed by the frame's own calibration. The LiDAR is rotated relative to the camera by up
+    to a degree, so yaw is not exactly -rotation_y - pi/2.
 
     Raises:
-        ValueError: an object has no 3D box; pass the list through `objects_3d` first.
+        ValueError: an object has no 3D box; filter the list with `objects_3d` first.
     """
     if not all(item.has_box_3d for item in objects):
         raise ValueError("objects without a 3D box have no place here: filter with objects_3d() first")
@@ -114,11 +114,11 @@ def objects_from_boxes(
     image_size_wh: Sequence[int] = DEFAULT_IMAGE_SIZE_WH,
     scores: Sequence[float] | NDArray[np.floating] | None = None,
 ) -> list[KittiObject]:
-    """The KITTI objects of LiDAR boxes (N, 7): the exact inverse of `boxes_from_objects`.
+    """Return the KITTI objects of LiDAR boxes (N, 7): the exact inverse of `boxes_from_objects`.
 
-    `bbox` surrounds the projected corners, clipped to the image; it is -1, -1, -1, -1 for a box that the
-    camera does not see, which KITTI's evaluation ignores for its lack of height. A box does not tell how much
-    of it is hidden: `truncated` and `occluded` are -1, as in KITTI's detection files.
+    `bbox` surrounds the projected corners, clipped to the image; it is -1, -1, -1, -1 for a box outside the
+    image, which KITTI's evaluation ignores for its lack of height. Truncation and occlusion are
+    unknown: `truncated` and `occluded` are -1, as in KITTI's detection files.
     """
     boxes = np.asarray(boxes, dtype=np.float64).reshape(-1, 7)
     heading = np.stack([np.cos(boxes[:, 6]), np.sin(boxes[:, 6])], axis=1)
@@ -148,15 +148,15 @@ def objects_from_boxes(
 
 
 def _headings_lidar_from_rect(calib: Calibration) -> NDArray[np.float64]:
-    """(2, 2), invertible: a level direction (x, z) of the camera to its (x, y) in the LiDAR frame."""
+    """Return the (2, 2) invertible map from a level direction (x, z) of the camera to (x, y) in the LiDAR frame."""
     return calib.lidar_from_rect_matrix[np.ix_([0, 1], [0, 2])]
 
 
 def parse_object(words: Sequence[str], place: str) -> KittiObject:
-    """The object of a line's words, 15 or 16; `place` is named in errors.
+    """Parse the 15 or 16 words of a line; `place` is named in errors.
 
     Raises:
-        DatasetError: the line is not one of KITTI's.
+        DatasetError: the line is not a KITTI label.
     """
     if len(words) not in (15, 16):
         raise DatasetError(
@@ -209,7 +209,7 @@ def _number(word: str, place: str) -> float:
 
 def _format_object(item: KittiObject) -> str:
     box = (item.height_m, item.width_m, item.length_m, item.x_m, item.y_m, item.z_m, item.rotation_y)
-    # KITTI prints unknown values (-1, -10, -1000) without decimals; "z" keeps -0.00 out of the files.
+    # KITTI prints unknown values (-1, -10, -1000) without decimals; "z" avoids -0.00.
     unknown = item.type == "DontCare"
     fields = [
         item.type,

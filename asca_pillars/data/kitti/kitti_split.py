@@ -31,13 +31,13 @@ from asca_pillars.scans.scan_reader import read_scan
 from asca_pillars.scans.stored_scans import stored_points
 
 SIMULATION_FILE = "simulation.json"
-"""File in the dataset's folder that records the settings of `asca simulate`."""
+"""File in the dataset's folder with the settings of `asca simulate`."""
 _PNG = b"\x89PNG\r\n\x1a\n\x00\x00\x00\rIHDR"  # the signature, then length and name of the first chunk
 
 
 @dataclass(frozen=True)
 class KittiSplit:
-    """The frames of one split of a KITTI-layout dataset.
+    """Frames of one split of a KITTI-layout dataset.
 
     `name` is a folder, "training" or "testing" (every scan in it), or the name of a list below ImageSets/
     ("train", "val", "trainval": frames of training/; "test": frames of testing/).
@@ -51,10 +51,10 @@ class KittiSplit:
 
     @cached_property
     def has_camera(self) -> bool:
-        """True if only the camera's view is labelled: always but in frames of `asca simulate --view around`.
+        """Whether only the camera's view is labelled: always except in frames of `asca simulate --view around`.
 
         Raises:
-            DatasetError: the note of the simulation is damaged.
+            DatasetError: the file of the simulation's settings is damaged.
         """
         path = Path(self.root) / SIMULATION_FILE
         try:
@@ -67,7 +67,7 @@ class KittiSplit:
 
     @property
     def pool(self) -> str:
-        """training or testing."""
+        """Folder name, training or testing."""
         return self.folder.name
 
     @property
@@ -77,7 +77,7 @@ class KittiSplit:
 
     @cached_property
     def frame_ids(self) -> tuple[str, ...]:
-        """The split's frames, sorted, without repetitions; all of them have a scan.
+        """Frames of the split, sorted, without repetitions; all of them have a scan.
 
         Raises:
             DatasetError: the folder or list is missing or empty, or a listed scan does not exist.
@@ -99,34 +99,34 @@ class KittiSplit:
         return tuple(sorted(listed))
 
     def scan_path(self, frame_id: str) -> Path:
-        """velodyne/<id>.bin."""
+        """Return the path velodyne/<id>.bin."""
         return self.folder / "velodyne" / f"{frame_id}.bin"
 
     def calib_path(self, frame_id: str) -> Path:
-        """calib/<id>.txt."""
+        """Return the path calib/<id>.txt."""
         return self.folder / "calib" / f"{frame_id}.txt"
 
     def label_path(self, frame_id: str) -> Path:
-        """label_2/<id>.txt."""
+        """Return the path label_2/<id>.txt."""
         return self.folder / "label_2" / f"{frame_id}.txt"
 
     def image_path(self, frame_id: str) -> Path:
-        """image_2/<id>.png, which need not exist."""
+        """Return the path image_2/<id>.png, which need not exist."""
         return self.folder / "image_2" / f"{frame_id}.png"
 
     def calibration(self, frame_id: str) -> Calibration:
-        """The frame's calibration; DatasetError if it is missing or damaged."""
+        """Read the frame's calibration; DatasetError if it is missing or damaged."""
         return read_calibration(self.calib_path(frame_id))
 
     def objects(self, frame_id: str) -> list[KittiObject]:
-        """The frame's labels, DontCare areas included; DatasetError if they are missing or damaged."""
+        """Read the frame's labels, including DontCare areas; DatasetError if they are missing or damaged."""
         return read_labels(self.label_path(frame_id))
 
     def image_size_wh(self, frame_id: str) -> tuple[int, int]:
-        """Width and height of the frame's image in pixels; KITTI's commonest size where there is no image.
+        """Return width and height of the frame's image in pixels; KITTI's most common size without an image.
 
         Raises:
-            DatasetError: there is one, and it is no PNG: labels would be cropped by a random size.
+            DatasetError: the image is not a PNG: labels would be cropped by a wrong size.
         """
         path = self.image_path(frame_id)
         try:
@@ -144,7 +144,7 @@ class KittiSplit:
         return size[0], size[1]
 
     def input_paths(self, frame_id: str) -> tuple[Path, ...]:
-        """Scan, labels and calibration."""
+        """Return the paths of scan, labels and calibration."""
         return self.scan_path(frame_id), self.label_path(frame_id), self.calib_path(frame_id)
 
     def require_files(self) -> None:
@@ -158,40 +158,40 @@ class KittiSplit:
 
     @property
     def to_sensor(self) -> FrameChange:
-        """The identity: scans are in the sensor's frame."""
+        """Identity: scans are in the sensor's frame."""
         return FrameChange.turn(0.0)
 
     def points(self, frame_id: str, *, camera_view: bool) -> NDArray[np.float32]:
-        """(N, 4) of the scan, LiDAR frame; with `camera_view` those that the camera sees."""
+        """Read the points (N, 4) of the scan, LiDAR frame; with `camera_view` those within the camera image."""
         points = read_scan(self.scan_path(frame_id)).points
         if camera_view:
             points = points[in_image(points, self.calibration(frame_id), self.image_size_wh(frame_id))]
         return points
 
     def in_labeled_view(self, frame_id: str, positions: NDArray[np.float32]) -> NDArray[np.bool_]:
-        """(N,) all of the positions."""
+        """Return (N,) True for all of the positions."""
         return np.ones(len(positions), bool)
 
     def stored_points(self, frame_id: str) -> NDArray[np.float32]:
-        """(N, 4) x, y, z in metres, LiDAR frame, and reflectance, as the file has them."""
+        """Read (N, 4) x, y, z in metres, LiDAR frame, and reflectance, as stored."""
         return stored_points(self.scan_path(frame_id), columns=None)
 
     def points_state(self, frame_id: str) -> tuple[int, ...]:
-        """Size of the image; size and time of scan and calibration."""
+        """Return the size of the image, and size and time of scan and calibration."""
         states = [path.stat() for path in (self.scan_path(frame_id), self.calib_path(frame_id))]
         numbers = [number for state in states for number in (state.st_size, state.st_mtime_ns)]
         return (*self.image_size_wh(frame_id), *numbers)
 
     def label_types(self, frame_id: str) -> list[str]:
-        """The type of every label, DontCare included."""
+        """Return the type of every label, including DontCare."""
         return [item.type for item in self.objects(frame_id)]
 
     def label_yaws(self, frame_id: str) -> NDArray[np.float64]:
-        """(M,) rotation_y in radians of every object with a 3D box."""
+        """Return the rotation_y (M,) in radians of every object with a 3D box."""
         return np.array([item.rotation_y for item in objects_3d(self.objects(frame_id))])
 
     def labeled_boxes(self, frame_id: str, types: Container[str] | None = None) -> LabeledBoxes:
-        """The frame's boxes in the LiDAR frame: those of `types`, or all that have a 3D box.
+        """Return the frame's boxes in the LiDAR frame: those of `types`, or all that have a 3D box.
 
         Raises:
             DatasetError: missing or damaged labels or calibration; an object of `types` without a 3D box.
@@ -214,10 +214,10 @@ def write_image_set(root: str | Path, name: str, frame_ids: Iterable[str]) -> No
 
 
 def read_image_set(root: Path, name: str) -> set[str]:
-    """The frame ids in ImageSets/<name>.txt.
+    """Read the frame ids in ImageSets/<name>.txt.
 
     Raises:
-        DatasetError: there is no such list, or it is empty or no text.
+        DatasetError: there is no such list, or it is empty or not text.
     """
     path = root / "ImageSets" / f"{name}.txt"
     try:
@@ -250,11 +250,11 @@ _IN_TRAIN = (
     "#4>|*2cwpU=#DlIf)U~UF$slh9*06RfVJ|aD;*fsBgf(16A`YCM@i7x@LKo|X`!1g1QJ7#no(q8P4hFRkW|$clCFZqo7-O;HHKGfk?C4#L~Otr"
     "&N6DER01y6`D$CjPaD~RH5BjM5>%_HEmZPRjtFK2<aq4Jk1QxYcdRfv;fjJ_U4mL0TtTS-"
 )
-"""A bit for each frame, first frame and highest bit first, in base85: 1 for the list `train`."""
+"""One bit per frame, first frame and highest bit first, in base85: 1 for the list `train`."""
 
 
 def train_val_frames() -> dict[str, list[str]]:
-    """The frame ids of the lists `train` and `val`, in ascending order."""
+    """Return the frame ids of the lists `train` and `val`, in ascending order."""
     in_train = np.unpackbits(np.frombuffer(base64.b85decode(_IN_TRAIN), np.uint8))[:FRAMES].astype(bool)
     lists = {"train": np.flatnonzero(in_train), "val": np.flatnonzero(~in_train)}
     return {name: [f"{number:06d}" for number in numbers] for name, numbers in lists.items()}

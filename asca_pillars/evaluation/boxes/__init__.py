@@ -1,1 +1,1 @@
-"""Metrics of boxes in the LiDAR frame, for any class and without a camera."""
+"""Detection metrics of boxes in the LiDAR frame, for any class and without a camera."""

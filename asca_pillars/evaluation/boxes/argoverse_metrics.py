@@ -1,15 +1,15 @@
 """Argoverse 2's detection metrics: AP by center distance, errors of true positives, and the composite score CDS.
 
 Definition: B. Wilson et al., "Argoverse 2: Next Generation Datasets for Self-Driving Perception and Forecasting",
-NeurIPS Datasets and Benchmarks 2021, and its API (`av2.evaluation.detection`) where that is brief:
+NeurIPS Datasets and Benchmarks 2021, and for details its API (`av2.evaluation.detection`):
 
-- Distance is that of the centers in 3D. In each frame a detection belongs to its nearest object, taken or not; of the
-  detections of an object the one with the highest score is a true positive if it is nearer than 0.5, 1, 2 and 4 m.
-- Up to 100 detections of a class in a frame count, by score, and what is less than 150 m away.
-- Precision at a recall is the best at that recall or beyond, taken at the recalls 0, 0.01, ... 1, in between linearly,
-  0 beyond the highest. AP is their mean, and the class' AP the mean over the distances.
-- Errors are means over the true positives below 2 m: ATE in m, ASE (`aligned_size_error`, which is not nuScenes'),
-  AOE in rad. Without one they are 2 m, 1 and pi.
+- Distance is that of the centers in 3D. In each frame a detection is assigned to its nearest object, matched or not; of
+  the detections of an object that with the highest score is a true positive if it is nearer than 0.5, 1, 2 and 4 m.
+- Up to 100 detections of a class per frame count, by score, at distances below 150 m.
+- Precision at a recall is the maximum at that recall or higher, sampled at the recalls 0, 0.01, ... 1, interpolated
+  linearly, 0 beyond the highest. AP is their mean, and the class' AP the mean over the distances.
+- Errors are means over the true positives below 2 m: ATE in m, ASE (`aligned_size_error`, unlike nuScenes'),
+  AOE in rad. Without a true positive they are 2 m, 1 and pi.
 - CDS = AP * mean(1 - ATE / 2 m, 1 - ASE, 1 - AOE / pi).
 
 The API restricts both sides to the map's region of interest; without a map everything counts here.
@@ -30,7 +30,7 @@ from asca_pillars.geometry.boxes import wrap_angle
 MAX_DETECTIONS = 100
 MAX_RANGE_M = 150.0
 _WORST = np.array([ERROR_DISTANCE_M, 1.0, pi])
-_TINY = 1e-10  # what the API adds to the number of detections
+_TINY = 1e-10  # added by the API to the number of detections
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class ArgoverseScore:
 
 
 def argoverse_scores(frames: Sequence[EvaluatedFrame], class_names: Sequence[str]) -> list[ArgoverseScore]:
-    """A score for every class."""
+    """Compute a score for every class."""
     within = [_in_range(frame) for frame in frames]
     return [_score(pair_class(within, name, _closeness), name) for name in class_names]
 
@@ -95,7 +95,7 @@ def _score(pairs: BoxPairs, name: str) -> ArgoverseScore:
 
 
 def _first_of_each(pairs: BoxPairs) -> tuple[NDArray[np.bool_], NDArray[np.int64], Floats]:
-    """Mask (N,) of the detections that count; index and distance of the object each is the first match of, else inf."""
+    """Return the mask (N,) of counted detections; index and distance of each one's first matched object, else inf."""
     count = len(pairs.scores)
     kept, owner, distance_m = np.ones(count, dtype=bool), np.full(count, UNMATCHED), np.full(count, np.inf)
     taken, in_frame = np.zeros(len(pairs.objects), dtype=bool), dict.fromkeys(pairs.frames.tolist(), 0)

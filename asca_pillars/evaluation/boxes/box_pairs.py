@@ -1,4 +1,4 @@
-"""Detections of one class matched greedily to its objects, best score first; bands of distance and direction."""
+"""Greedy matching of one class's detections to its objects by descending score; distance and direction bands."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -21,10 +21,10 @@ class EvaluatedFrame:
     """Labels and detections of one frame, LiDAR frame.
 
     Attributes:
-        frame_id: its name.
+        frame_id: name of the frame.
         objects: (M, 7) labelled boxes.
         object_types: class of each.
-        visible: (M,) whether an object holds a point; one without cannot be found, and is neither missed nor false.
+        visible: (M,) whether an object contains a point; one without is neither missed nor makes a detection false.
         found: (N, 7) detected boxes.
         found_types: class of each.
         scores: (N,).
@@ -41,7 +41,7 @@ class EvaluatedFrame:
 
 @dataclass(frozen=True, eq=False)
 class BoxPairs:
-    """N detections of a class by descending score, and its K objects that count.
+    """N detections of a class by descending score, and its K counted objects.
 
     Attributes:
         scores: (N,).
@@ -49,8 +49,8 @@ class BoxPairs:
         frames: (N,) number of each detection's frame.
         objects: (K, 7).
         first: (N,) the first object of the detection's frame, and
-        closeness: how close each object of the frame is, from the first one on.
-        excuse: (N,) closeness of the closest object that does not count; -inf without one.
+        closeness: closeness of each object of the frame, from the first one on.
+        excuse: (N,) closeness of the closest object that is not counted; -inf without one.
     """
 
     scores: Floats
@@ -62,7 +62,7 @@ class BoxPairs:
     excuse: Floats
 
     def match(self, close_enough: Callable[[float], bool]) -> Ints:
-        """(N,) index of the object that each detection takes, or UNMATCHED."""
+        """Return the index (N,) of the object matched to each detection, or UNMATCHED."""
         matched = np.full(len(self.scores), UNMATCHED)
         taken = np.zeros(len(self.objects), dtype=bool)
         for row, (first, close) in enumerate(zip(self.first.tolist(), self.closeness, strict=True)):
@@ -77,9 +77,9 @@ class BoxPairs:
 
 
 def pair_class(frames: Sequence[EvaluatedFrame], class_name: str, closeness: Closeness) -> BoxPairs:
-    """The detections and objects of one class over all frames.
+    """Collect the detections and objects of one class over all frames.
 
-    Objects without a point, and those of a neighboring type (KITTI's Van for Car), do not count.
+    Objects without a point, and those of a neighboring type (KITTI's Van for Car), are not counted.
     """
     found, scores, numbers, objects, first, rows, excuse = [], [], [], [], [], [], []
     start = 0
@@ -113,7 +113,7 @@ def pair_class(frames: Sequence[EvaluatedFrame], class_name: str, closeness: Clo
 
 
 Band = Callable[[NDArray[np.floating]], Mask]
-"""(N, 7) boxes -> (N,) which centers it holds."""
+"""(N, 7) boxes -> (N,) whether each center is inside."""
 
 
 def _distance(low_m: float, high_m: float) -> Band:
@@ -141,14 +141,14 @@ BANDS: dict[str, Band] = {
     "beside": _direction(pi / 4, 3 * pi / 4),
     "behind": _direction(3 * pi / 4, inf),
 }
-"""By horizontal distance from the sensor, and by direction: 45 degrees either way of straight ahead, of straight
-behind, and what is between."""
+"""Bands of horizontal distance from the sensor, and of direction: within 45 degrees of straight ahead, of straight
+behind, and the rest."""
 
 
 def in_band(pairs: BoxPairs, matched: Ints, band: str) -> tuple[Mask, Mask, int]:
-    """Masks (N,) of the detections that a band counts and of the hits among them, and its number of objects.
+    """Return masks (N,) of a band's detections and of the true positives among them, and its number of objects.
 
-    An object takes its detection along: only what matches nothing is judged by where it stands itself.
+    A matched detection is in the band of its object; only an unmatched one is assigned by its own center.
     """
     counted, hits = BANDS[band](pairs.found), matched != UNMATCHED
     held = BANDS[band](pairs.objects)

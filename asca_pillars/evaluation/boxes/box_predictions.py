@@ -1,6 +1,6 @@
-"""Labelled boxes of a dataset, and predictions as `asca detect` writes them, assigned to its frames.
+"""Labelled boxes of a dataset, and predictions of `asca detect` assigned to its frames.
 
-A line of predictions belongs to the frame that its scan's file name or its time says.
+A line of predictions is assigned by the file name of its scan or by its time stamp.
 """
 
 import json
@@ -23,19 +23,19 @@ from asca_pillars.evaluation.predictions import shortage
 from asca_pillars.geometry.boxes import points_in_boxes
 
 _SAME_TIME_S = 1e-3
-_DEEPEST = 64  # folders of a scan's path that are looked at
+_DEEPEST = 64  # folders of a scan's path that are compared
 
 
 def predictions_by_frame(path: Path, split: LabeledSplit) -> dict[str, NamedRecords]:
-    """The lines of a *.jsonl or *.csv file by the frames that they belong to; lines of other frames are left out.
+    """Assign the lines of a *.jsonl or *.csv file to frames; lines of other frames are left out.
 
-    A message of a recording (a line with a time, whose scan is no file: `drive.mcap/000003`) belongs to the frame of
-    its time. Its number is no frame's name: a recording may begin later than the dataset. A file belongs to the frame
-    whose id is the longest end of its path; where there is none, to that of its time, if it has one.
+    A message of a recording (a line with a time, whose scan is no file: `drive.mcap/000003`) is assigned by
+    its time. Its number is not a frame's name: a recording may begin later than the dataset. A file is assigned to the
+    frame whose id is the longest end of its path; without one, by its time, if it has one.
 
     Raises:
         DatasetError: the file cannot be read; a line's name and time are of two frames, or its time is of several; a
-            frame has two lines; no line belongs to a frame.
+            frame has two lines; no line can be assigned.
     """
     known, times = set(split.frame_ids), split.times_s if isinstance(split, BoxSplit) else {}
     timed_ids, stamps_s = tuple(times), np.array(list(times.values()))
@@ -55,9 +55,9 @@ def predictions_by_frame(path: Path, split: LabeledSplit) -> dict[str, NamedReco
 
 
 def stated_scope(path: Path, lines: Iterable[NamedRecords]) -> DetectorScope | None:
-    """Scope of the detector, if all lines state the same; None if it is unknown.
+    """Return the scope of the detector, if all lines state the same; None if it is unknown.
 
-    Lines of earlier versions state nothing; then a `recording.json` beside `path`, the file of the lines, does.
+    Lines of earlier versions do not state it; then a `recording.json` in the folder of `path` does.
 
     Raises:
         DatasetError: that file cannot be read.
@@ -101,7 +101,7 @@ def _frame_of_line(
 
 
 def _frame_of_scan(scan: str, frame_ids: set[str]) -> str | None:
-    """The frame whose id is the longest end of a scan's path; None if there is none."""
+    """Return the frame whose id is the longest end of a scan's path; None if there is none."""
     path = PurePosixPath(scan.replace("\\", "/"))
     parts = path.with_suffix("").parts[-_DEEPEST:] if path.name else ()
     ends = ("/".join(parts[first:]) for first in range(len(parts)))
@@ -109,24 +109,24 @@ def _frame_of_scan(scan: str, frame_ids: set[str]) -> str | None:
 
 
 NEAR_LABEL_M = 4.0
-"""From an object that is labelled at the edge of the view: the largest distance at which any protocol matches."""
+"""Distance from an object labelled at the edge of the view: the largest at which any protocol matches."""
 
 
 @dataclass(frozen=True)
 class BoxFrames:
-    """Frames with labels and predictions, those that have no predictions, and what the detector could have found."""
+    """Frames with labels and predictions, frames without predictions, and the scope of the detector."""
 
     frames: tuple[EvaluatedFrame, ...]
     without_predictions: tuple[str, ...]
     scope: DetectorScope | None
-    """None where the predictions do not state it."""
+    """None if the predictions do not state it."""
 
     def __len__(self) -> int:
         return len(self.frames)
 
     @property
     def shortage(self) -> str | None:
-        """One sentence that belongs beside every number if not all frames were evaluated; None if all were."""
+        """Sentence to print with every result if not all frames were evaluated; None if all were."""
         return shortage(len(self), self.without_predictions, "no predictions", 'needs a line with "boxes": []')
 
 
@@ -158,13 +158,13 @@ def write_box_predictions(
 def read_box_predictions(path: Path, split: LabeledSplit, *, reporter: Reporter = SILENT) -> BoxFrames:
     """Pair the labels of a split with the predictions of a *.jsonl or *.csv file.
 
-    Boxes are in the scan's own frame, as labels are. `predictions_by_frame` says which frame a line belongs to; lines
-    of other frames are left out, and so are boxes where nothing is labelled.
+    Boxes are in the scan's own frame, as labels are. Lines are assigned by `predictions_by_frame`; lines
+    of other frames are left out, and so are boxes in unlabelled regions.
 
     Args:
         path: the file, or a folder that `asca detect` wrote.
         split: the labels.
-        reporter: of the progress.
+        reporter: for the progress.
 
     Raises:
         DatasetError: as `predictions_by_frame`; a prediction without a score.
@@ -190,7 +190,7 @@ def read_box_predictions(path: Path, split: LabeledSplit, *, reporter: Reporter 
 def _can_be_judged(
     split: LabeledSplit, frame_id: str, objects: NDArray[np.float32], found: NDArray[np.float32]
 ) -> NDArray[np.bool_]:
-    """Mask of the boxes (N, 7) in the labelled view, or so near one of `objects` that they may match it."""
+    """Return the mask of the boxes (N, 7) in the labelled view, or close enough to one of `objects` to match it."""
     apart = np.linalg.norm(found[:, None, :2] - objects[None, :, :2], axis=2)
     return np.asarray(split.in_labeled_view(frame_id, found[:, :3]) | (apart < NEAR_LABEL_M).any(axis=1))
 

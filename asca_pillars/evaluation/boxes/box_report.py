@@ -1,4 +1,4 @@
-"""The report of an evaluation without a camera: the same tables on the console, as Markdown and as JSON."""
+"""Report of an evaluation without a camera: the same tables on the console, as Markdown and as JSON."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -26,7 +26,7 @@ class BoxReport:
     """Result of an evaluation by one of the box protocols, with all its numbers."""
 
     subject: str
-    """The model or file and the data, in words."""
+    """Description of the model or file and the data."""
     protocol: BoxProtocol
     frames: BoxFrames
     class_names: tuple[str, ...]
@@ -39,7 +39,7 @@ class BoxReport:
 
     @property
     def title(self) -> str:
-        """The subject, and how many frames stand behind the numbers."""
+        """Subject and number of frames."""
         return f"{self.subject}: {self.frames.shortage or f'{len(self.frames)} frames'}"
 
 
@@ -67,13 +67,13 @@ def box_report(
 
 
 def box_tables(report: BoxReport) -> list[TextTable]:
-    """AP or distance metrics, the same by band, recall and precision."""
+    """Return the tables of AP or distance metrics, the same by band, recall and precision."""
     metrics = [_iou_table(report)] if report.protocol == "iou" else [_nuscenes_table(report), _argoverse_table(report)]
     return [*metrics, _band_table(report), _score_table(report)]
 
 
 def box_notes(report: BoxReport) -> list[str]:
-    """Notes for the reader of the tables: classes left out, objects that do not count, scores to choose."""
+    """Return notes on the tables: classes left out, objects not counted, best scores."""
     types = Counter(kind for frame in report.frames.frames for kind in frame.object_types)
     others = [f"{name} ({count})" for name, count in types.items() if name not in report.class_names]
     hidden = sum(int((~frame.visible).sum()) for frame in report.frames.frames)
@@ -113,7 +113,7 @@ def _scope_note(report: BoxReport) -> str | None:
 
 
 def box_json(report: BoxReport) -> dict[str, Any]:
-    """Everything in the report; AP and CDS in percent."""
+    """Return the whole report; AP and CDS in percent."""
     metrics: dict[str, Any] = {"iou": [asdict(item) for item in report.iou]}
     if report.protocol == "distance":
         metrics = {

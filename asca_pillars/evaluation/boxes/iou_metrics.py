@@ -1,4 +1,4 @@
-"""Metrics by IoU without a camera: AP in 3D and from above (BEV), recall and precision at a fixed score."""
+"""Metrics by IoU without a camera: AP in 3D and bird's-eye view (BEV), recall and precision at a fixed score."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ _CLOSENESS = {"3d": iou_3d, "bev": bev_iou}
 
 @dataclass(frozen=True)
 class IouScore:
-    """AP of one class in percent; None where there is no object."""
+    """AP of one class in percent; None without objects."""
 
     class_name: str
     metric: Metric
@@ -30,7 +30,7 @@ class IouScore:
 
 
 def iou_scores(frames: Sequence[EvaluatedFrame], class_names: Sequence[str]) -> list[IouScore]:
-    """AP for every class, metric, IoU and band, in that order."""
+    """Compute the AP for every class, metric, IoU and band, in that order."""
     scores = []
     for name in class_names:
         metrics: tuple[Metric, ...] = ("3d", "bev")
@@ -47,12 +47,12 @@ def iou_scores(frames: Sequence[EvaluatedFrame], class_names: Sequence[str]) -> 
 
 
 def match_by_iou(pairs: BoxPairs, least: float) -> NDArray[np.int64]:
-    """(N,) the object that each detection takes by an IoU of at least `least`, or UNMATCHED."""
+    """Return the index (N,) of the object matched to each detection with an IoU of at least `least`, or UNMATCHED."""
     return pairs.match(lambda overlap: overlap >= least)
 
 
 def area_under_curve(hits: NDArray[np.bool_], objects: int) -> float | None:
-    """Percent, from the detections (N,) by descending score; None without objects."""
+    """Compute the AP in percent of detections (N,) by descending score; None without objects."""
     if not objects:
         return None
     precision = np.cumsum(hits) / np.arange(1, len(hits) + 1)
@@ -65,7 +65,7 @@ MATCH_M = 2.0
 
 @dataclass(frozen=True)
 class FixedScore:
-    """Scores of one class in one band, by centers less than MATCH_M apart on the ground."""
+    """Scores of one class in one band; centers less than MATCH_M apart on the ground match."""
 
     class_name: str
     score: float
@@ -74,23 +74,23 @@ class FixedScore:
     found: int
     detections: int
     best_score: float | None
-    """From which on detections have the best F1 (harmonic mean of recall and precision); None if nothing is found."""
+    """Score threshold with the best F1 (harmonic mean of recall and precision); None without a true positive."""
 
     @property
     def recall(self) -> float | None:
-        """None without objects."""
+        """Recall; None without objects."""
         return self.found / self.objects if self.objects else None
 
     @property
     def precision(self) -> float | None:
-        """None without detections."""
+        """Precision; None without detections."""
         return self.found / self.detections if self.detections else None
 
 
 def fixed_scores(
     frames: Sequence[EvaluatedFrame], class_names: Sequence[str], scores: Mapping[str, float]
 ) -> list[FixedScore]:
-    """For every class and band the recall and precision of detections from the class' score on."""
+    """Compute recall and precision at the class's score threshold, for every class and band."""
     results = []
     for name in class_names:
         pairs = pair_class(frames, name, lambda found, objects: -ground_distance(found, objects))

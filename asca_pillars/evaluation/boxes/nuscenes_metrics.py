@@ -1,19 +1,19 @@
 """nuScenes' detection metrics: AP by center distance, and the errors of true positives.
 
 Definition: H. Caesar et al., "nuScenes: A Multimodal Dataset for Autonomous Driving", CVPR 2020, section 3.1, and its
-devkit (1.1) where that is brief:
+devkit (1.1) for details:
 
-- A detection matches by the distance of centers on the ground, below 0.5, 1, 2 and 4 m, as `box_pairs` says.
-- Precision is taken at the recalls 0, 0.01, ... 1, in between linearly, 0 beyond the highest recall. AP is the mean
-  over the recalls above 0.1 of what precision exceeds 0.1 by, divided by 0.9. The class' AP is the mean over the
+- A detection matches by the distance of centers on the ground, below 0.5, 1, 2 and 4 m, as in `box_pairs`.
+- Precision is sampled at the recalls 0, 0.01, ... 1, interpolated linearly, 0 beyond the highest recall. AP is the mean
+  over the recalls above 0.1 of the precision above 0.1, divided by 0.9. The class' AP is the mean over the
   distances.
-- Errors are those of the matches below 2 m: ATE distance of centers on the ground in m, ASE 1 - IoU of the sizes laid
-  over each other, AOE smallest difference of yaw in rad. Their running mean over the matches, by descending score,
-  is taken at the scores that belong to the recalls, and averaged over the achieved recalls above 0.1. Where a recall of
+- Errors are those of the matches below 2 m: ATE distance of centers on the ground in m, ASE 1 - IoU of the aligned
+  sizes, AOE smallest difference of yaw in rad. Their running mean over the matches, by descending score,
+  is sampled at the scores of the recalls, and averaged over the achieved recalls above 0.1. If a recall of
   0.1 is not achieved, each error is 1.
 
-Not here: velocity and attributes, hence NDS, which a single scan has nothing to say about; the limits of range per
-class and the half turn that nuScenes forgives its barriers.
+Not included: velocity and attributes, hence NDS, which need more than a single scan; the range limits per
+class and nuScenes' tolerance of half a turn for barriers.
 """
 
 from collections.abc import Sequence
@@ -48,7 +48,7 @@ class NuScenesScore:
 
 
 def nuscenes_scores(frames: Sequence[EvaluatedFrame], class_names: Sequence[str]) -> list[NuScenesScore]:
-    """A score for every class and band, in that order."""
+    """Compute a score for every class and band, in that order."""
     scores = []
     for name in class_names:
         pairs = pair_class(frames, name, lambda boxes, objects: -ground_distance(boxes, objects))
@@ -58,24 +58,24 @@ def nuscenes_scores(frames: Sequence[EvaluatedFrame], class_names: Sequence[str]
 
 
 def ground_distance(a: Floats, b: Floats) -> Floats:
-    """Distance of centers on the ground in m: (N, 7), (M, 7) -> (N, M)."""
+    """Return distance of centers on the ground in m: (N, 7), (M, 7) -> (N, M)."""
     return np.hypot(a[:, None, 0] - b[None, :, 0], a[:, None, 1] - b[None, :, 1])
 
 
 def match_by_distance(pairs: BoxPairs, limit_m: float) -> NDArray[np.int64]:
-    """(N,) the object that each detection takes from less than `limit_m` away, or UNMATCHED."""
+    """Return the index (N,) of the object matched to each detection at less than `limit_m`, or UNMATCHED."""
     return pairs.match(lambda closeness: -closeness < limit_m)
 
 
 def match_errors(boxes: Floats, objects: Floats) -> Floats:
-    """(K, 3) distance on the ground in m, 1 - IoU of the sizes, difference of yaw in rad, of K matches (K, 7)."""
+    """Return (K, 3) ground distance in m, 1 - IoU of the sizes and yaw difference in rad of K matches (K, 7)."""
     moved = np.hypot(boxes[:, 0] - objects[:, 0], boxes[:, 1] - objects[:, 1])
     turned = np.abs(wrap_angle(boxes[:, 6] - objects[:, 6]))
     return np.stack([moved, size_error(boxes, objects), turned], axis=1)
 
 
 def size_error(boxes: Floats, objects: Floats) -> Floats:
-    """(K,) 1 - IoU of boxes (K, 7) that are laid over each other, center on center and heading on heading."""
+    """Return 1 - IoU (K,) of boxes (K, 7) after alignment of centers and yaws."""
     shared = np.minimum(boxes[:, 3:6], objects[:, 3:6]).prod(axis=1)
     return 1 - shared / (boxes[:, 3:6].prod(axis=1) + objects[:, 3:6].prod(axis=1) - shared)
 
@@ -97,7 +97,7 @@ def _score(pairs: BoxPairs, matches: dict[float, NDArray[np.int64]], name: str, 
 
 
 def _at_recalls(hits: NDArray[np.bool_], values: Floats, objects: int) -> Floats:
-    """(101,) what `values` of the detections (N,) are at each recall; 0 beyond the highest."""
+    """Interpolate `values` of the detections (N,) at each recall: (101,); 0 beyond the highest."""
     if not hits.any():
         return np.zeros(len(RECALLS))
     return np.interp(RECALLS, np.cumsum(hits) / objects, values, right=0)

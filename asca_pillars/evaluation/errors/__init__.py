@@ -1,1 +1,1 @@
-"""Why boxes are missed, false or badly placed: errors by view, distance, occlusion and points, and pictures of them."""
+"""Error analysis: missed, false and inaccurate boxes by view, distance, occlusion and points, with pictures."""

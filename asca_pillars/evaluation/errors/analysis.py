@@ -1,4 +1,4 @@
-"""Preparation of an error analysis: which rows stand beside those of the data, and the report."""
+"""Preparation of an error analysis: datasets to compare, and the report."""
 
 import json
 from collections.abc import Sequence
@@ -16,11 +16,11 @@ from asca_pillars.evaluation.report_page import ReportPage
 
 @dataclass(frozen=True)
 class ErrorAnalysis:
-    """What an error analysis compares.
+    """Inputs of an error analysis.
 
     Attributes:
-        name: of the data in the tables.
-        parts: frame ids of each part of them, by its name.
+        name: name of the data in the tables.
+        parts: frame ids of each part of the data, by its name.
         beside: reports of other evaluations.
     """
 
@@ -30,13 +30,13 @@ class ErrorAnalysis:
 
 
 def prepare_errors(who: str, split: LabeledSplit, by: str | None, beside: Sequence[Path]) -> ErrorAnalysis:
-    """Read what stands beside an evaluation: before a model runs, so that mistakes show at once.
+    """Read the inputs of an error analysis: before a model runs, so that errors are found early.
 
     Args:
-        who: the model or its predictions.
+        who: name of the model or its predictions.
         split: the frames.
         by: see `evaluation.errors.error_report.parts_of`; None for no parts.
-        beside: errors.json of other evaluations.
+        beside: errors.json of other evaluations, for the same tables.
 
     Raises:
         ConfigError, DatasetError: as `parts_of` and `read_report`.
@@ -49,7 +49,7 @@ def prepare_errors(who: str, split: LabeledSplit, by: str | None, beside: Sequen
 
 
 def who_predicted(predictions: Path) -> str:
-    """The model's name where `asca eval` wrote the predictions, else that of the file or folder."""
+    """Return the model's name if `asca eval` wrote the predictions, else that of the file or folder."""
     made_by = (predictions if predictions.is_dir() else predictions.parent) / MADE_BY
     try:
         return str(json.loads(made_by.read_text(encoding="utf-8"))["model"]["name"])
@@ -66,7 +66,7 @@ def report_errors(
     out: Path,
     reporter: Reporter,
 ) -> ReportPage:
-    """Analyze and write; `scores` holds the classes to evaluate."""
+    """Analyze the errors and write the report; `scores` has the classes to evaluate."""
     return write_errors(
         frames,
         scores,

@@ -1,19 +1,19 @@
 """Matches of objects and detections, and the errors of matched boxes along the axes of their labels.
 
-Each reported detection, the best score first, takes the free object of its class, or of the neighboring type (KITTI's
-Van for Car), that it overlaps most from above, if that is at least `evaluation.recall`'s minimum. Then what is left,
-detections and objects, is matched alike from LOCALIZATION_IOU on: these boxes are not found, but badly placed, and
-their errors count among those of the others. Detections that stay without an object are false. Their kinds are those of
-TIDE (Bolya et al., ECCV 2020), with overlaps from above:
+Each reported detection, by descending score, is matched to the free object of its class, or of the neighboring type
+(KITTI's Van for Car), with the largest BEV IoU, if that is at least `evaluation.recall`'s minimum. The remaining
+detections and objects are matched in the same way from LOCALIZATION_IOU on: these objects are not found, but
+the errors of these boxes are included. Detections without an object are false positives. Their kinds are those of
+TIDE (Bolya et al., ECCV 2020), with BEV IoU:
 
     localization     at LOCALIZATION_IOU or more on an object of its class, below the minimum
     classification   at LOCALIZATION_IOU or more on an object of another class
     duplicate        on an object that a better detection has taken
     background       on no label
 
-Errors are predicted minus label. Ends and sides are faces: positive means drawn too far out. The ray-facing axis is the
+Errors are predicted minus label. Ends and sides are faces: positive means too far out. The ray-facing axis is the
 label's heading or its opposite, whichever points away from the sensor; the near end is the face where it enters. For an
-object seen side-on no end is the nearer one, for one seen end-on no side is; the names are then arbitrary.
+object seen side-on no end is nearer, for one seen end-on no side is; the names are then arbitrary.
 """
 
 from dataclasses import dataclass
@@ -61,25 +61,25 @@ CORRECTIONS: dict[str, tuple[int, ...]] = {
     "label's bottom and top": (_BOTTOM, _TOP),
     "label's heading": (_HEADING,),
 }
-"""Parts of a box that `corrected` takes from the label, as columns of `box_residuals`."""
+"""Parts of a box that `corrected` replaces by the label's, as columns of `box_residuals`."""
 
 
 @dataclass(frozen=True, eq=False)
 class ObjectMatch:
-    """A labelled object of an evaluated class, and the detection that found it.
+    """Labelled object of an evaluated class, and the detection matched to it.
 
     Attributes:
-        frame: index of its frame.
-        class_name: its type.
+        frame: index of the frame.
+        class_name: type of the object.
         box: (7,) label, sensor at the origin.
-        points: in the box, at least one.
-        view_deg: between heading and line of sight, 0 to 90.
+        points: number of points in the box, at least one.
+        view_deg: angle between heading and line of sight, 0 to 90.
         neighbor_m: distance to the nearest other object of its type.
-        counted: is to be found, by the protocol.
-        found: a reported detection overlaps it enough.
-        below_score: it is not, but would be by a detection below the score.
-        detection: (7,) the detection that found it, or that is badly placed on it; None without one.
-        score: of that detection.
+        counted: counts as an object to find, by the protocol.
+        found: matched to a reported detection.
+        below_score: not found, but would be by a detection below the score threshold.
+        detection: (7,) the detection matched to it, with enough overlap or less; None without one.
+        score: score of that detection.
     """
 
     frame: int
@@ -99,16 +99,16 @@ class ObjectMatch:
 
 @dataclass(frozen=True, eq=False)
 class DetectionMatch:
-    """A detection of an evaluated class that reaches its least score.
+    """Detection of an evaluated class with at least the lowest score.
 
     Attributes:
-        frame: index of its frame.
-        class_name: its type.
+        frame: index of the frame.
+        class_name: type of the detection.
         box: (7,) sensor at the origin.
-        score: its own.
-        reported: reaches the score from which on detections count.
-        kind: one of FALSE_KINDS for a false one, "found" on a counted object, "ignored" for one that is neither.
-        label: type of the object that a false one stands on; empty for `background`.
+        score: score of the detection.
+        reported: reaches the score threshold.
+        kind: one of FALSE_KINDS for a false positive, "found" on a counted object, "ignored" otherwise.
+        label: type of the object that a false positive overlaps; empty for `background`.
     """
 
     frame: int
@@ -121,12 +121,12 @@ class DetectionMatch:
 
     @property
     def is_false(self) -> bool:
-        """Whether it counts and is false."""
+        """Whether it is a reported false positive."""
         return self.reported and self.kind in FALSE_KINDS
 
 
 def least_iou(class_name: str) -> float:
-    """The overlap from above from which on an object counts as found."""
+    """Return the least BEV IoU of a found object."""
     return BEV_IOU.get(class_name, SMALL_BEV_IOU)
 
 
@@ -150,7 +150,7 @@ def match_frame(
     reported = scores >= score
     overlap = bev_iou(boxes, frame.objects)
 
-    # The best score comes first, so that detections below the score take no object from those above it.
+    # Descending scores, so that detections below the threshold do not match objects before those above it.
     match = _match(overlap, np.ones(len(order), bool), related, least_iou(class_name))
     found = (match >= 0) & np.append(reported, False)[match]
     unmatched = reported.copy()
@@ -196,10 +196,10 @@ def match_frame(
 
 
 def box_residuals(found: Floats, labels: Floats) -> Floats:
-    """Errors of boxes found[k] against labels[k], sensor at the origin: (K, 7), (K, 7) -> (K, len(RESIDUALS)).
+    """Compute errors of boxes found[k] against labels[k], sensor at the origin: (K, 7), (K, 7) -> (K, len(RESIDUALS)).
 
-    A box that is turned by more than 45 degrees against its label's axis is taken by its other axis: what it covers
-    counts for ends and sides, and its heading error is the turn itself.
+    A box rotated by more than 45 degrees against its label's axis is compared along its other axis: its extent
+    gives ends and sides, and its heading error is the rotation itself.
     """
     turn = wrap_angle(found[:, 6] - labels[:, 6])
     axis_turn = wrap_angle(turn, np.pi)
@@ -232,9 +232,9 @@ def box_residuals(found: Floats, labels: Floats) -> Floats:
 
 
 def boxes_from_residuals(labels: Floats, residuals: Floats) -> Floats:
-    """Inverse of `box_residuals`: (K, 7), (K, len(RESIDUALS)) -> (K, 7), from ends, sides, bottom, top and heading.
+    """Invert `box_residuals`: (K, 7), (K, len(RESIDUALS)) -> (K, 7), from ends, sides, bottom, top and heading.
 
-    Boxes that are turned by more than 45 degrees come back with the same footprint, length and width exchanged.
+    Boxes rotated by more than 45 degrees are returned with the same footprint, length and width exchanged.
     """
     part = dict(zip(RESIDUALS, residuals.T, strict=True))
     axis, near_side = _ray_facing_axes(labels)
@@ -255,14 +255,14 @@ def boxes_from_residuals(labels: Floats, residuals: Floats) -> Floats:
 
 
 def corrected(labels: Floats, residuals: Floats, part: str) -> Floats:
-    """The boxes (K, 7) of these residuals with one part, a key of CORRECTIONS, taken from the labels (K, 7)."""
+    """Return the boxes (K, 7) of these residuals with one part, a key of CORRECTIONS, set to the labels' (K, 7)."""
     kept = residuals.copy()
     kept[:, list(CORRECTIONS[part])] = 0.0
     return boxes_from_residuals(labels, kept)
 
 
 def _ray_facing_axes(labels: Floats) -> tuple[Floats, Floats]:
-    """Unit vectors (K, 2) of the labels' ray-facing axes, and on which side of them the sensor is: (K,), 1 is left."""
+    """Return unit vectors (K, 2) of the labels' ray-facing axes, and the sensor's side of them: (K,), 1 is left."""
     heading = np.stack([np.cos(labels[:, 6]), np.sin(labels[:, 6])], axis=1)
     axis = np.where((heading * labels[:, :2]).sum(axis=1, keepdims=True) < 0, -heading, heading)
     sensor_left = labels[:, 0] * axis[:, 1] - labels[:, 1] * axis[:, 0]
@@ -270,7 +270,7 @@ def _ray_facing_axes(labels: Floats) -> tuple[Floats, Floats]:
 
 
 def _match(overlap: Floats, detections: Mask, objects: Mask, least: float) -> Ints:
-    """Match some detections with some objects by (D, M) overlaps: (M,) detection that each object gets, or _NONE."""
+    """Match some detections with some objects by (D, M) overlaps: (M,) detection of each object, or _NONE."""
     rows, columns = np.flatnonzero(detections), np.flatnonzero(objects)
     matched, items = match_by_overlap(overlap[np.ix_(rows, columns)], least)
     match = np.full(overlap.shape[1], _NONE)
@@ -279,7 +279,7 @@ def _match(overlap: Floats, detections: Mask, objects: Mask, least: float) -> In
 
 
 def _false_kind(overlap: Floats, types: NDArray[np.object_], related: Mask, least: float) -> tuple[str, str]:
-    """Kind of a false detection and the type of the label it stands on, from its overlaps (M,) with the objects."""
+    """Return the kind of a false positive and the type of the overlapped label, from its overlaps (M,)."""
     for chosen, low, kind in (
         (related, least, "duplicate"),
         (related, LOCALIZATION_IOU, "localization"),
@@ -292,7 +292,7 @@ def _false_kind(overlap: Floats, types: NDArray[np.object_], related: Mask, leas
 
 
 def _nearest_m(boxes: Floats, mask: Mask) -> Floats:
-    """Distance (M,) from each box (M, 7) to the nearest other one that a mask (M,) chooses; infinite without one."""
+    """Return the distance (M,) from each box (M, 7) to the nearest other one in a mask (M,); infinite without one."""
     apart = np.linalg.norm(boxes[:, None, :2] - boxes[None, :, :2], axis=2)
     np.fill_diagonal(apart, np.inf)
     return np.where(mask, apart, np.inf).min(axis=1, initial=np.inf)

@@ -25,7 +25,7 @@ DIFFICULTY = "moderate"
 
 @dataclass(frozen=True, eq=False)
 class ErrorFrame:
-    """One frame with its labels and detections. Metres and radians, LiDAR frame moved to the sensor.
+    """Frame with its labels and detections. Metres and radians, LiDAR frame translated to the sensor.
 
     Attributes:
         frame_id: name of the frame in its dataset.
@@ -35,11 +35,11 @@ class ErrorFrame:
         occluded: (M,) KITTI's 0 to 3, or UNKNOWN_OCCLUSION.
         truncated: (M,) 0..1, 0 where unknown.
         object_points: (M,) points in each box.
-        counted: (M,) objects that count: within the protocol's limits and with a point inside.
+        counted: (M,) objects that are counted: within the protocol's limits and with a point inside.
         found: (D, 7) detected boxes.
         found_types: types of the detections.
         scores: (D,).
-        ignored: (D,) detections that are never false: in a DontCare area, or smaller in the image than KITTI labels.
+        ignored: (D,) detections that are never false: in a DontCare area, or below KITTI's minimum height in the image.
     """
 
     frame_id: str
@@ -57,24 +57,24 @@ class ErrorFrame:
 
 
 class ErrorFrames(Protocol):
-    """The frames of an evaluation, read one by one: points of a thousand scans need not fit in memory."""
+    """Frames of an evaluation, read one by one, since the points of a thousand scans may exceed the memory."""
 
     @property
     def frame_ids(self) -> Sequence[str]:
         """Sorted frame ids."""
 
     def read(self, frame_id: str) -> ErrorFrame:
-        """One frame; DatasetError or ScanError if a file of it is missing or damaged."""
+        """Read one frame; DatasetError or ScanError if a file of it is missing or damaged."""
 
 
 @dataclass(frozen=True)
 class KittiErrorFrames:
-    """Frames of KITTI's layout with predictions as KITTI text; objects count within the limits of moderate.
+    """Frames of KITTI's layout with predictions as KITTI text; objects are counted within the limits of moderate.
 
     Attributes:
         split: scans and calibrations.
         labels, predictions: folders of the text.
-        class_names: classes that are evaluated.
+        class_names: evaluated classes.
         frame_ids: ids of the frames with predictions, sorted.
     """
 
@@ -85,7 +85,7 @@ class KittiErrorFrames:
     frame_ids: tuple[str, ...]
 
     def read(self, frame_id: str) -> ErrorFrame:
-        """One frame; types are spelt as KITTI and `class_names` spell them."""
+        """Read one frame; types are spelt as in KITTI and `class_names`."""
         calibration = self.split.calibration(frame_id)
         labelled = read_labels(self.labels / f"{frame_id}.txt")
         truth = [item for item in labelled if item.has_box_3d]
@@ -117,7 +117,7 @@ class KittiErrorFrames:
 
 @dataclass(frozen=True)
 class BoxErrorFrames:
-    """Frames of any layout with boxes in the LiDAR frame; an object counts if it holds a point.
+    """Frames of any layout with boxes in the LiDAR frame; objects with a point are counted.
 
     Attributes:
         split: the scans.
@@ -133,7 +133,7 @@ class BoxErrorFrames:
         return tuple(sorted(self._by_id))
 
     def read(self, frame_id: str) -> ErrorFrame:
-        """One frame; occlusion is unknown."""
+        """Read one frame; occlusion is unknown."""
         frame, change = self._by_id[frame_id], self.split.to_sensor
         points = change.points(self.split.points(frame_id, camera_view=False))
         objects = change.boxes(np.asarray(frame.objects)).astype(np.float64)

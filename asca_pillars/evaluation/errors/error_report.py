@@ -1,4 +1,4 @@
-"""The report of the error analysis: errors.json, errors.md and errors.html with tables that can be sorted."""
+"""Report of the error analysis: errors.json, errors.md and errors.html with sortable tables."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -95,12 +95,12 @@ def error_page(
     notes: Sequence[str],
     sections: Sequence[CaseSection],
 ) -> str:
-    """The page as HTML.
+    """Return the page as HTML.
 
     Args:
-        title: what was evaluated.
-        tables: as they are printed.
-        more: tables that are folded away.
+        title: subject of the evaluation.
+        tables: printed tables.
+        more: collapsed tables.
         notes: definitions.
         sections: cases with pictures (`worst_cases.draw_cases`).
     """
@@ -180,7 +180,7 @@ PRODUCTS: dict[str, Recognizer] = {
     MARKDOWN: ending_with(_END),
     PAGE: ending_with(_END),
 }
-"""Output files, and how a run recognizes its own."""
+"""Output files, and the recognizer of a run's own files."""
 BY_LIST = "list"
 
 
@@ -189,8 +189,8 @@ class ErrorReport(Strict):
     """Contents of errors.json.
 
     Attributes:
-        subject: the model or folder and the data, in words.
-        datasets: the whole, then its parts.
+        subject: description of the model or folder and the data.
+        datasets: the whole dataset, then its parts.
         about: model, command, machine and versions.
     """
 
@@ -203,7 +203,7 @@ def read_report(path: Path) -> ErrorReport:
     """Read an errors.json.
 
     Raises:
-        DatasetError: there is none, or it is no such file.
+        DatasetError: the file is missing, or not such a file.
         ConfigError: its content is of another version; names the key.
     """
     try:
@@ -220,14 +220,14 @@ def read_report(path: Path) -> ErrorReport:
 
 
 def parts_of(root: Path, split: str, frame_ids: Sequence[str], by: str) -> dict[str, list[str]]:
-    """Divide frames into parts whose rows stand beside those of the whole.
+    """Divide frames into parts, which are rows of the tables in addition to the whole.
 
     Args:
-        root: of the dataset.
-        split: name of the list that is evaluated.
-        frame_ids: of it.
-        by: BY_LIST for the other lists of ImageSets/, of which each that lies within the frames is a part; or a whole
-            number, by as many characters as begin the frame ids.
+        root: folder of the dataset.
+        split: name of the evaluated list.
+        frame_ids: frame ids of the list.
+        by: BY_LIST for the other lists of ImageSets/ that lie within the frames; or an integer, for parts by that
+            number of first characters of the frame ids.
 
     Raises:
         ConfigError: `by` is neither, or gives no part.
@@ -269,14 +269,14 @@ def write_errors(
 
     Args:
         frames: labels and predictions.
-        scores: for each class to evaluate, from which on detections count.
-        subject: what was evaluated, in words.
-        name: of the dataset in the tables.
+        scores: score threshold of each class to evaluate.
+        subject: description of the evaluated model and data.
+        name: name of the dataset in the tables.
         parts: frame ids of each part, by its name.
-        beside: reports of other evaluations, whose datasets stand in the same tables.
-        about: for the JSON.
-        out: folder of the evaluation.
-        reporter: of the progress.
+        beside: reports of other evaluations, whose datasets are shown in the same tables.
+        about: contents for the JSON.
+        out: output folder of the evaluation.
+        reporter: for the progress.
 
     Raises:
         DatasetError, ScanError: a frame cannot be read.

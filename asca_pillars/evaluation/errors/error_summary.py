@@ -1,4 +1,4 @@
-"""Errors of a dataset as numbers: per class and group of objects, what false detections are, how labels fit points."""
+"""Errors of a dataset as numbers: per class and group of objects, kinds of false positives, label fit."""
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -31,7 +31,7 @@ from asca_pillars.geometry.overlap import paired_iou_3d
 
 BLOCK_FRAMES = 10
 MIN_BLOCKS = 5
-"""Values of fewer blocks have no interval: they may be of one object."""
+"""Least number of blocks for an interval: values of fewer may be of one object."""
 DRAWS = 300
 SHARE = 0.95
 _SEED = 0
@@ -44,19 +44,19 @@ class Resamples:
     """Bootstrap samples, as counts of each frame.
 
     Attributes:
-        weights: (DRAWS, F) whole numbers.
-        blocks: (F,) number of the block that each frame belongs to.
+        weights: (DRAWS, F) integers.
+        blocks: (F,) block number of each frame.
     """
 
     weights: _Doubles
     blocks: NDArray[np.int64]
 
     def median_interval(self, values: _Doubles, frames: NDArray[np.int64]) -> tuple[float, float] | None:
-        """Interval of the median of values (N,), in their unit; None of too few blocks.
+        """Return the interval of the median of values (N,), in their unit; None with too few blocks.
 
         Args:
             values: numbers.
-            frames: index of the frame that each is from.
+            frames: index of the frame of each value.
         """
         if len(np.unique(self.blocks[frames])) < MIN_BLOCKS:
             return None
@@ -68,7 +68,7 @@ class Resamples:
         return _interval(values[order][middle])
 
     def ratio_interval(self, parts: _Doubles, wholes: _Doubles) -> tuple[float, float] | None:
-        """Interval of the ratio sum(parts) / sum(wholes), counts (F,) by frame; None of too few blocks."""
+        """Return the interval of the ratio sum(parts) / sum(wholes), counts (F,) by frame; None with too few blocks."""
         if len(np.unique(self.blocks[wholes > 0])) < MIN_BLOCKS:
             return None
         whole = self.weights @ wholes
@@ -80,8 +80,8 @@ def resamples(parts: Sequence[NDArray[np.int64]], frames: int) -> Resamples:
     """Draw blocks of neighboring frames; the same draws for the same frames.
 
     Args:
-        parts: indices of the frames of each part, in order; frames that are in none of them are drawn never.
-        frames: how many there are.
+        parts: indices of the frames of each part, in order; frames that are in none of them are never drawn.
+        frames: number of frames.
     """
     generator = np.random.default_rng(_SEED)
     groups = [np.array_split(part, max(round(len(part) / BLOCK_FRAMES), 1)) for part in parts if len(part)]
@@ -108,7 +108,7 @@ POINTS = (1, 20, 100, inf)
 NEIGHBORS_M = (0.0, 1.0, 2.0, inf)
 OCCLUSIONS = ("fully visible", "partly occluded")
 LARGELY_OCCLUDED = "largely occluded"
-"""Objects that are not counted, of which a detection is neither right nor wrong."""
+"""Objects that are not counted: their detections are neither true nor false positives."""
 OTHER_IOU_3D = 0.5
 ALL, CLEAR = "all", "clear"
 VIEWS = ("clear, end-on", "clear, oblique", "clear, side-on")
@@ -135,15 +135,15 @@ class Spread(Strict):
 
 @dataclass(frozen=True)
 class GroupErrors(Strict):
-    """Objects of one class that have something in common.
+    """Objects of one class and group.
 
     Attributes:
-        group: one of MAIN_GROUPS, or by distance, occlusion, points, or the next object of the class.
-        objects: how many there are.
-        found: how many of them were found.
-        below_score: how many of the others have a box that is good enough but below the score.
-        recall_interval: of found / objects.
-        residuals: of the boxes on them, found or badly placed (`box_errors`), by the names of RESIDUALS.
+        group: one of MAIN_GROUPS, or a group by distance, occlusion, points, or the nearest object of the class.
+        objects: number of objects.
+        found: number of found objects.
+        below_score: number of the others with a sufficient box below the score threshold.
+        recall_interval: interval of found / objects.
+        residuals: residuals of their boxes, found or inaccurate (`box_errors`), by the names of RESIDUALS.
     """
 
     group: str
@@ -156,14 +156,14 @@ class GroupErrors(Strict):
 
 @dataclass(frozen=True)
 class FalseDetections(Strict):
-    """The false detections of one class.
+    """False positives of one class.
 
     Attributes:
-        kinds: how many of each of FALSE_KINDS.
-        labels: types of the objects that those that are no `background` stand on, and how many.
-        per_frame: how many in a frame.
-        per_frame_interval: of it.
-        traits: share of those of `background` that have each of TRAITS, and "none".
+        kinds: number of each of FALSE_KINDS.
+        labels: types of the objects overlapped by those other than `background`, and their numbers.
+        per_frame: number per frame.
+        per_frame_interval: its interval.
+        traits: share of those of `background` with each of TRAITS, and "none".
         surroundings: distance_m, points, top_m, reflectance and cluster_length_m of those of `background`.
     """
 
@@ -177,15 +177,15 @@ class FalseDetections(Strict):
 
 @dataclass(frozen=True)
 class ClassErrors(Strict):
-    """Everything about one class.
+    """All results of one class.
 
     Attributes:
-        score: from which on detections count.
-        best_score: the score with the best F1 at the overlap from above that finds an object; None without a find.
-        iou_3d: 3D IoU that `reaching` asks for: KITTI's of the class, OTHER_IOU_3D for any other.
-        boxes: boxes on counted objects, found or badly placed.
-        reaching: share of them that reach it as drawn, and with each of CORRECTIONS or WITHOUT_MEDIANS.
-        label_fit: of unoccluded, untruncated objects, by the names of STATISTICS.
+        score: score threshold.
+        best_score: the score with the best F1 at the BEV IoU of a found object; None without a found object.
+        iou_3d: 3D IoU for `reaching`: KITTI's of the class, OTHER_IOU_3D for any other.
+        boxes: boxes on counted objects, found or inaccurate.
+        reaching: share of them that reach it as predicted, and with each of CORRECTIONS or WITHOUT_MEDIANS.
+        label_fit: fit of unoccluded, untruncated objects, by the names of STATISTICS.
     """
 
     class_name: str
@@ -201,7 +201,7 @@ class ClassErrors(Strict):
 
 @dataclass(frozen=True)
 class DatasetErrors(Strict):
-    """A dataset, or a part of it."""
+    """Results of a dataset, or a part of it."""
 
     name: str
     frames: int
@@ -214,9 +214,9 @@ class Matches:
 
     Attributes:
         frame_ids: names of the frames; matches carry their index.
-        scores: for each evaluated class from which on detections count.
-        objects, fits: the objects, and a row of `label_fit` for each; NaN where an object is hidden or cut.
-        detections, surroundings: the detections, and what stands at those that are reported and false.
+        scores: score threshold of each evaluated class.
+        objects, fits: the objects, and a row of `label_fit` for each; NaN if an object is occluded or truncated.
+        detections, surroundings: the detections, and the surroundings of reported false positives.
     """
 
     frame_ids: tuple[str, ...]
@@ -231,9 +231,9 @@ def match_frames(frames: ErrorFrames, scores: Mapping[str, float], *, reporter: 
     """Match every frame.
 
     Args:
-        frames: to be read one by one.
-        scores: for each class to evaluate, from which on detections count.
-        reporter: of the progress.
+        frames: the frames, read one by one.
+        scores: score threshold of each class to evaluate.
+        reporter: for the progress.
 
     Raises:
         DatasetError, ScanError: a frame cannot be read.
@@ -258,13 +258,13 @@ def match_frames(frames: ErrorFrames, scores: Mapping[str, float], *, reporter: 
 def summarize(
     matches: Matches, name: str, parts: Mapping[str, Sequence[str]], *, reporter: Reporter = SILENT
 ) -> list[DatasetErrors]:
-    """Numbers about all frames, named `name`, then about each part of them.
+    """Summarize all frames, named `name`, then each part of them.
 
     Args:
         matches: of all frames.
-        name: of the whole.
-        parts: frame ids of each part, by its name; they need not hold all frames.
-        reporter: of the progress.
+        name: name of the whole.
+        parts: frame ids of each part, by its name; they need not cover all frames.
+        reporter: for the progress.
     """
     index = {frame_id: number for number, frame_id in enumerate(matches.frame_ids)}
     indices = {part: np.array(sorted(index[one] for one in ids if one in index)) for part, ids in parts.items()}
@@ -281,19 +281,19 @@ def summarize(
 
 
 def view_of(view_deg: float) -> str:
-    """One of VIEWS for the angle between heading and line of sight."""
+    """Return one of VIEWS for the angle between heading and line of sight."""
     return VIEWS[0 if view_deg < END_ON_DEG else 1 if view_deg <= SIDE_ON_DEG else 2]
 
 
 def is_clear(item: ObjectMatch) -> bool:
-    """Whether an object is near and neither hidden nor cut, as far as the labels say."""
+    """Return whether an object is near and labelled neither occluded nor truncated."""
     near = np.hypot(item.box[0], item.box[1]) <= CLEAR_RANGE_M
     return bool(near) and _is_whole(item.occluded, item.truncated)
 
 
 @dataclass(frozen=True, eq=False)
 class _Part:
-    """The matches of the frames that a mask (F,) chooses."""
+    """Matches of the frames in a mask (F,)."""
 
     matches: Matches
     frames: _Mask
@@ -372,7 +372,7 @@ class _Part:
         *,
         shares: Sequence[str] = (),
     ) -> dict[str, Spread]:
-        """One for each column of values (N, len(names)); values that are NaN are left out."""
+        """Compute the spread of each column of values (N, len(names)); NaN values are left out."""
         result = {}
         for name, column in zip(names, values.T, strict=True):
             kept = np.isfinite(column)
@@ -403,7 +403,7 @@ def _is_whole(occluded: int, truncated: float) -> bool:
 
 
 def _groups(objects: Sequence[ObjectMatch]) -> dict[str, _Mask]:
-    """Masks (N,) of the groups in the order of the report; they need not hold any object."""
+    """Return masks (N,) of the groups in the order of the report; groups may be empty."""
     counted = np.array([item.counted for item in objects], bool)
     clear = counted & np.array([is_clear(item) for item in objects], bool)
     view = np.array([view_of(item.view_deg) for item in objects], dtype=object)
@@ -442,7 +442,7 @@ def _reaching(labels: NDArray[np.float64], residuals: NDArray[np.float64], iou: 
 
 
 def _best_score(detections: list[DetectionMatch], counted: int) -> float | None:
-    """The score with the best F1 of counted objects found; None if none is."""
+    """Return the score threshold with the best F1 of counted objects; None if none is found."""
     judged = [item for item in detections if item.kind != "ignored"]
     scores = np.array([item.score for item in judged])
     order = np.argsort(-scores, kind="stable")

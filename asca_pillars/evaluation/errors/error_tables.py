@@ -1,4 +1,4 @@
-"""The tables of the error analysis: datasets, and parts of them, below one another for every group of objects."""
+"""Tables of the error analysis: datasets and their parts as rows for every group of objects."""
 
 from collections.abc import Sequence
 
@@ -23,7 +23,7 @@ from asca_pillars.evaluation.errors.label_fit import END_ON_DEG, MAX_RANGE_M, ST
 from asca_pillars.evaluation.report_page import TextTable
 
 PRINTED_NOTES = 4
-"""Number of notes needed to read the first tables; the others explain traits and statistics."""
+"""Number of notes needed for the first tables; the others explain traits and statistics."""
 _NONE = "-"
 _BOX_COLUMNS = (
     "near_end",
@@ -47,7 +47,7 @@ _TITLES = {
 
 
 def error_tables(datasets: Sequence[DatasetErrors]) -> list[TextTable]:
-    """Box errors by view, 3D overlap, false detections and label fit; datasets are rows in their order."""
+    """Return tables of box errors by view, 3D IoU, false positives and label fit; rows in the order of datasets."""
     names = _class_names(datasets)
     tables = [_box_table(datasets, name, main=True) for name in names]
     tables += [_reaching_table(datasets, names), _false_table(datasets, names), _background_table(datasets, names)]
@@ -56,13 +56,13 @@ def error_tables(datasets: Sequence[DatasetErrors]) -> list[TextTable]:
 
 
 def group_tables(datasets: Sequence[DatasetErrors]) -> list[TextTable]:
-    """Box errors by distance, occlusion, points and neighbors."""
+    """Return tables of box errors by distance, occlusion, points and neighbors."""
     tables = [_box_table(datasets, name, main=False) for name in _class_names(datasets)]
     return [table for table in tables if table.rows]
 
 
 def error_notes(datasets: Sequence[DatasetErrors]) -> list[str]:
-    """Definitions that one must know to read the tables."""
+    """Return the definitions needed to read the tables."""
     names = _class_names(datasets)
     overlaps = ", ".join(f"{name} {least_iou(name):g}" for name in names)
     return [

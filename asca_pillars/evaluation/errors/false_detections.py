@@ -1,8 +1,8 @@
-"""Surroundings of false detections: height, brightness, number of points, and points beside the box.
+"""Surroundings of false positives: height, brightness, number of points, and points beside the box.
 
-Everything is measured on the points of the scan that lie above the ground, whatever they belong to. A detection may
-have several traits or none. The traits are the same for every class, and mean different things: where a person is
-detected and points go on to more than 2.3 m stands a post or a trunk, where a car is, a van, a wall or a hedge.
+Everything is measured on all points of the scan above the ground. A detection may
+have several traits or none. The traits are the same for every class, but have different causes: points above 2.3 m at a
+detected person indicate a post or a trunk, at a car a van, a wall or a hedge.
 """
 
 from collections.abc import Sequence
@@ -20,7 +20,7 @@ BRIGHT_REFLECTANCE = 0.5
 BRIGHT_SHARE = 0.25
 HOLLOW_SHARE = 0.05
 LONG_M = 5.0
-_FOOT_M = 0.2  # lower points may be the ground's
+_FOOT_M = 0.2  # lower points may be of the ground
 _MARGIN_M = 0.1
 _BESIDE_M = 1.0
 _AROUND_M = 12.0
@@ -41,15 +41,15 @@ class Surroundings:
     """Statistics of the points at a detection. Metres; NaN without points above the ground.
 
     Attributes:
-        distance_m: horizontal, of the box's center.
-        points: in the box, widened by 0.1 m, above the ground.
+        distance_m: horizontal distance of the box's center.
+        points: number in the box, widened by 0.1 m, above the ground.
         top_m: highest point above the ground over the footprint, also above the box.
-        bottom_m: the lowest one.
-        box_top_m: of the box, above the ground.
+        bottom_m: lowest point.
+        box_top_m: top of the box, above the ground.
         reflectance: mean of the points in the box.
-        bright: share of them with at least BRIGHT_REFLECTANCE.
-        beside: points beside the box, at its height, for each point in it.
-        cluster_length_m, cluster_width_m: of the rectangle around what its points are joined to.
+        bright: share of those with at least BRIGHT_REFLECTANCE.
+        beside: number of points beside the box, at its height, per point in it.
+        cluster_length_m, cluster_width_m: size of the rectangle around the cluster of its points.
         middle: share of its points in the middle half of length and width.
     """
 
@@ -67,7 +67,7 @@ class Surroundings:
 
     @property
     def traits(self) -> tuple[str, ...]:
-        """The keys of TRAITS that hold."""
+        """Keys of TRAITS that hold."""
         holds = {
             "few points": self.points < FEW_POINTS,
             "tall": self.top_m > TALL_M,
@@ -83,12 +83,12 @@ class Surroundings:
 def describe(
     points: NDArray[np.float32], ground: Ground | None, boxes: Sequence[NDArray[np.float64]]
 ) -> list[Surroundings]:
-    """Describe what stands at K boxes (7,) in a scan (N, 4), metres, the sensor at the origin.
+    """Describe the surroundings of K boxes (7,) in a scan (N, 4), metres, the sensor at the origin.
 
     Args:
         points: x, y, z, reflectance.
         ground: `data.insertion.ground_fit.fit_ground` of the points; without it the ground is each box's own bottom.
-        boxes: of detections.
+        boxes: boxes of detections.
     """
     return [_describe_one(points, ground, box) for box in boxes]
 
@@ -129,7 +129,7 @@ def _describe_one(points: NDArray[np.float32], ground: Ground | None, box: NDArr
 
 
 def _joined_extent(offset: NDArray[np.float64], inside: NDArray[np.bool_]) -> tuple[float, float]:
-    """Length and width of what most points (N,) of a box are joined to, points (N, 2) around it; metres."""
+    """Return length and width, metres, of the cluster with most points (N,) of a box, among points (N, 2)."""
     labels = cluster_labels(offset)
     own = np.bincount(labels[inside]).argmax()
     joined = offset[labels == own] if own else offset[inside]

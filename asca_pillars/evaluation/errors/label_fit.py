@@ -1,12 +1,12 @@
-"""Fit of labelled boxes to the points of their objects; no detector takes part.
+"""Fit of labelled boxes to the points of their objects, without a detector.
 
-Two datasets whose labels fit their points differently teach a network different boxes. Compare, for example, a
+Two datasets whose labels fit their points differently train different boxes. Compare, for example, a
 simulated dataset with a real one, or the drives of a real one with each other.
 
 Everything is measured along a box's own axes. The ray-facing axis is the heading or its opposite, whichever points away
 from the sensor: along it the near face comes first and the far face last. Objects of at least VEHICLE_LENGTH_M are
-measured end-on only, where the visible flank and the visible end tell length and width apart; of smaller ones, which
-are seen as a whole, the range is measured.
+measured end-on only, where the visible flank and the visible end separate length and width; for smaller ones, which
+are visible as a whole, the range is measured.
 """
 
 from typing import NamedTuple
@@ -22,7 +22,7 @@ VEHICLE_LENGTH_M = 2.5
 END_ON_DEG = 18.0
 MIN_POINTS = 25
 MIN_DENSE_POINTS = 80
-"""Points that an extreme percentile needs."""
+"""Least number of points for an extreme percentile."""
 
 STATISTICS = {
     "flank_end": "end of the visible flank - far face (97th percentile of the low points, end-on)",
@@ -39,7 +39,7 @@ STATISTICS = {
     "range_95": "95th percentile of the points' range - range of the center",
     "range_spread": "range of the farthest point - range of the nearest",
 }
-"""Names of the columns of `label_fit`. Metres, but for the two shares."""
+"""Names of the columns of `label_fit`. Metres, except for the two shares."""
 
 
 class _BoxPoints(NamedTuple):
@@ -47,8 +47,8 @@ class _BoxPoints(NamedTuple):
 
     Attributes:
         along: positive towards the far face.
-        across: to the left of it.
-        up: above the bottom.
+        across: positive to the left of that axis.
+        up: height above the bottom.
         depth: along the line of sight.
     """
 
@@ -64,8 +64,8 @@ class _BoxPoints(NamedTuple):
 def label_fit(points: NDArray[np.floating], boxes: NDArray[np.floating]) -> NDArray[np.float64]:
     """Measure labels against points: (N, >= 3), (M, 7) -> (M, len(STATISTICS)), metres or shares.
 
-    A statistic that an object does not allow is NaN: too far away, too few points, or not seen end-on. Objects that
-    are hidden or cut by the image's border tell nothing about their labels; leave them out.
+    A statistic that cannot be measured is NaN: too far away, too few points, or not end-on. Leave out objects that
+    are occluded or truncated.
 
     Args:
         points: x, y, z in metres, the sensor at the origin.
@@ -87,7 +87,7 @@ def label_fit(points: NDArray[np.floating], boxes: NDArray[np.floating]) -> NDAr
 
 
 def view_angle_deg(boxes: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Angle between heading and line of sight of boxes (N, 7) seen from the origin: (N,) degrees.
+    """Return the angle between heading and line of sight of boxes (N, 7) seen from the origin: (N,) degrees.
 
     0 is end-on, from the front or the rear; 90 is side-on.
     """
@@ -151,10 +151,10 @@ def _heads_away(box: NDArray[np.float64]) -> bool:
 
 
 def _last(values: NDArray[np.float64]) -> float:
-    """The third largest, as one or two points may be strays; NaN of fewer than five values."""
+    """Return the third largest value, since one or two points may be outliers; NaN for fewer than five values."""
     return float(np.sort(values)[-3]) if len(values) > 4 else float("nan")
 
 
 def _percentile(values: NDArray[np.float64], share: float) -> float:
-    """NaN of fewer than five values."""
+    """Return a percentile; NaN for fewer than five values."""
     return float(np.percentile(values, share)) if len(values) > 4 else float("nan")

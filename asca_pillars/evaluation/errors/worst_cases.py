@@ -1,4 +1,4 @@
-"""The worst of each kind of error as pictures (SVG): false detections, missed objects and boxes with large errors."""
+"""Pictures (SVG) of the worst errors of each kind: false positives, missed objects and inaccurate boxes."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -16,9 +16,9 @@ from asca_pillars.evaluation.errors.error_summary import BLOCK_FRAMES, Matches, 
 from asca_pillars.evaluation.errors.false_detections import BRIGHT_REFLECTANCE, Surroundings
 from asca_pillars.geometry.boxes import footprints
 
-MAX_POINTS = 1200  # of a pane; more are thinned out
+MAX_POINTS = 1200  # of a pane; more are subsampled
 VIEW_TITLES = ("from above", "from the side", "from the sensor")
-_LOW_M, _HIGH_M = -0.5, 3.3  # heights that are drawn
+_LOW_M, _HIGH_M = -0.5, 3.3  # range of drawn heights
 _GROUND_M = 0.15
 _GAP_CM = 20
 _Doubles = NDArray[np.float64]
@@ -26,7 +26,7 @@ _Doubles = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class DrawnBox:
-    """A box (7,), sensor at the origin, and whose it is; `main` is what the picture is about."""
+    """Box (7,), sensor at the origin, and its source; `main` is the subject of the picture."""
 
     box: _Doubles
     kind: Literal["label", "detection"]
@@ -38,10 +38,10 @@ class _Pane:
     """Points (N, 2) in metres, to the right and up, and outlines in the same axes.
 
     Attributes:
-        low, high: (2,) corners of what is shown.
-        near: (N,) points that belong to what the picture is about; the others are pale.
-        bright: (N,) points of a high reflectance.
-        outlines: each with its class of style.
+        low, high: (2,) corners of the visible area.
+        near: (N,) points drawn strongly; the others are pale.
+        bright: (N,) points of high reflectance.
+        outlines: each with its style class.
     """
 
     points: _Doubles
@@ -53,15 +53,15 @@ class _Pane:
 
 
 def crop_svg(points: NDArray[np.float32], ground: Ground | None, boxes: Sequence[DrawnBox]) -> str:
-    """Three views of the surroundings of the first box, an <svg> element with lengths in centimetres.
+    """Draw three views of the surroundings of the first box, as an <svg> element with lengths in centimetres.
 
-    From above the line of sight points up. From the side the first box's ray-facing axis points to the right, and only
-    what lies within its width is strong. From the sensor what lies within its depth is strong.
+    In bird's-eye view the line of sight points up. In the side view the first box's ray-facing axis points right, and
+    only points within its width are strong. In the sensor's view those within its depth are strong.
 
     Args:
         points: (N, 4) x, y, z in metres, the sensor at the origin, and reflectance.
-        ground: under them; without it the first box's bottom.
-        boxes: to be drawn; the first one is in the middle.
+        ground: ground surface; without it the first box's bottom is used.
+        boxes: drawn boxes; the first one is centered.
     """
     middle = boxes[0].box
     reach = max(2.5, middle[3] / 2 + 2.0)
@@ -119,14 +119,14 @@ def _style(one: DrawnBox) -> str:
 
 
 def _arrow(one: DrawnBox, middle: _Doubles) -> _Doubles:
-    """(2, 2) from the box's center to a little beyond its front."""
+    """Return the (2, 2) line from the box's center to slightly beyond its front."""
     heading = np.array([np.cos(one.box[6]), np.sin(one.box[6])])
     start = one.box[:2] - middle[:2]
     return np.stack([start, start + heading * (one.box[3] / 2 + 0.25)])
 
 
 def _upright(horizontal: _Doubles, box: _Doubles, floor: float) -> _Doubles:
-    """(4, 2) rectangle of a box seen from the side, from its corners' places (4,) to the right."""
+    """Return the (4, 2) rectangle of a box in side view, from the horizontal positions (4,) of its corners."""
     left, right = float(horizontal.min()), float(horizontal.max())
     bottom, top = (float(box[2] + side * box[5] / 2 - floor) for side in (-1, 1))
     return np.array([[left, bottom], [right, bottom], [right, top], [left, top]])
@@ -162,14 +162,14 @@ def _svg(panes: Sequence[_Pane], reach_cm: int) -> str:
 
 
 def _dots(pane: _Pane, mask: NDArray[np.bool_]) -> str:
-    """A path of dots, each a line of no length with round ends."""
+    """Return a path of dots, each a line of zero length with round ends."""
     pixels = np.unique(_pixels(pane, pane.points[mask]), axis=0)
     step = -(-len(pixels) // MAX_POINTS)
     return "".join(f"M{x} {y}h0" for x, y in pixels[:: max(step, 1)])
 
 
 def _pixels(pane: _Pane, places: _Doubles) -> NDArray[np.int64]:
-    """Metres (N, 2) as whole centimetres from the upper left corner."""
+    """Convert metres (N, 2) to whole centimetres from the upper left corner."""
     return np.round(100 * np.stack([places[:, 0] - pane.low[0], pane.high[1] - places[:, 1]], axis=1)).astype(np.int64)
 
 
@@ -178,15 +178,15 @@ FALSE_CASES, MISSED_CASES, BOX_CASES = 24, 12, 6
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """One error and how to show it.
+    """Error and its picture.
 
     Attributes:
         frame: index of its frame.
-        boxes: what is drawn strongly, the first one in the middle.
-        texts: what stands below the picture.
-        error: what cases of one section are ordered by, the largest first.
-        score: of the detection; 0 without one.
-        points: in the first box.
+        boxes: drawn boxes, the first one centered.
+        texts: caption lines.
+        error: sort key of the cases of a section, largest first.
+        score: score of the detection; 0 without one.
+        points: number in the first box.
         frame_id, svg: name of the frame and picture, from `draw_cases`.
     """
 
@@ -215,9 +215,9 @@ class CaseSection:
 
 
 def worst_cases(matches: Matches) -> list[CaseSection]:
-    """For every class the worst cases of each kind; of BLOCK_FRAMES neighboring frames at most one in a section.
+    """Select the worst cases of each kind for every class; per section at most one of BLOCK_FRAMES neighboring frames.
 
-    Neighboring frames of a drive show the same error again and again.
+    Neighboring frames of a drive have the same errors.
     """
     sections = []
     for name in matches.scores:
@@ -239,7 +239,7 @@ def worst_cases(matches: Matches) -> list[CaseSection]:
 def draw_cases(
     frames: ErrorFrames, matches: Matches, sections: Sequence[CaseSection], *, reporter: Reporter = SILENT
 ) -> list[CaseSection]:
-    """The same sections with a picture (`crops.crop_svg`) of each case; every frame is read once.
+    """Return the sections with a picture (`crops.crop_svg`) of each case; every frame is read once.
 
     Raises:
         DatasetError, ScanError: a frame cannot be read.

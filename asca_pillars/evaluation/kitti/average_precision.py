@@ -1,20 +1,20 @@
-"""The official KITTI object protocol: average precision in the image (2D), from above (BEV) and in 3D, and AOS.
+"""Official KITTI object protocol: average precision in the image (2D), bird's-eye view (BEV) and 3D, and AOS.
 
 Follows Geiger et al., "Are we ready for autonomous driving? The KITTI vision benchmark suite" (CVPR 2012), as the
 official C++ tool computes it, with its 41 samples of recall:
 
 - Ground truth and detections are counted, ignored or absent, per class and difficulty (`states`).
-- They match at an overlap *above* 0.7 (Car) or 0.5 (others), in 2D, BEV and 3D alike. A box stands on its location.
-- Ground truth is processed in file order (`matching`). The first pass, by score, gives the scores at which recall comes
+- They match at an IoU *above* 0.7 (Car) or 0.5 (others), in 2D, BEV and 3D alike. A box's location is its bottom.
+- Ground truth is processed in file order (`matching`). The first pass, by score, gives the scores at which recall is
   nearest to 0, 1/40 ... 1; the second, by overlap, counts at each of these scores.
-- What counts and was not used up is a false positive; in 2D only, not if more than the same 0.7 or 0.5 of it lies in
-  a DontCare area. These have no 3D box, so on them detections are false in BEV and 3D.
-- Precision stands at the threshold's index and becomes the maximum of itself and all that follow. R11 is the mean of
+- Counted detections that are not assigned are false positives; in 2D only, not if more than the same 0.7 or 0.5 of
+  one is in a DontCare area. These areas have no 3D box, so detections in them are false in BEV and 3D.
+- Precision at each threshold's index is replaced by the maximum of itself and all later ones. R11 is the mean of
   entries 0, 4 .. 40, R40 (Simonelli et al., "Disentangling monocular 3D object detection", ICCV 2019) of 1 .. 40.
 - AOS is the same in 2D with (1 + cos(difference of alpha)) / 2 for each true positive.
 
-What the tool does not evaluate is absent rather than 0: a class in 2D unless some detection of it has x1 >= 0, in BEV
-unless some has x != -1000, in 3D unless some has y != -1000; AOS if any detection at all has alpha -10.
+Results that the tool does not evaluate are absent rather than 0: a class in 2D unless a detection of it has x1 >= 0,
+in BEV unless one has x != -1000, in 3D unless one has y != -1000; AOS if any detection at all has alpha -10.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -50,11 +50,11 @@ class Curve:
     """Precision over recall of one class, metric and difficulty.
 
     Attributes:
-        class_name, metric, difficulty: what it is of; `metric` is one of METRICS, `difficulty` of DIFFICULTIES.
+        class_name, metric, difficulty: `metric` is one of METRICS, `difficulty` one of DIFFICULTIES.
         precision: (41,) fractions at recall 0, 1/40 .. 1, each the maximum of itself and all later ones; for "aos"
-            the orientation similarity in its place.
-        counted: objects that count.
-        matched: how many of them have a counted detection.
+            the orientation similarity instead.
+        counted: number of counted objects.
+        matched: number of these with a counted detection.
         thresholds: (T,) scores, descending; T <= 41.
         tp, fp, fn: (T,) true and false positives and missed objects at these scores.
     """
@@ -82,12 +82,12 @@ class Curve:
 
     @property
     def r11_cap(self) -> float:
-        """The `r11` of a perfect detector: below 100 if 40 objects or fewer count."""
+        """R11 of a perfect detector: below 100 if 40 objects or fewer are counted."""
         return 100 * min(-(-self.counted // 4), 11) / 11
 
     @property
     def r40_cap(self) -> float:
-        """The `r40` of a perfect detector: below 100 if 40 objects or fewer count."""
+        """R40 of a perfect detector: below 100 if 40 objects or fewer are counted."""
         return 100 * min(max(self.counted - 1, 0), _RECALL_STEPS) / _RECALL_STEPS
 
 
@@ -96,9 +96,9 @@ class KittiResults:
     """Results of the protocol for a set of frames.
 
     Attributes:
-        curves: by class name, metric and difficulty; absent where the official tool does not evaluate.
-        class_names: the classes asked for.
-        frames: how many frames were evaluated.
+        curves: by class name, metric and difficulty; absent if the official tool does not evaluate it.
+        class_names: requested classes.
+        frames: number of evaluated frames.
     """
 
     curves: dict[tuple[str, str, str], Curve]
@@ -106,17 +106,17 @@ class KittiResults:
     frames: int
 
     def curve(self, class_name: str, metric: str, difficulty: str) -> Curve | None:
-        """One curve, or None where the official tool does not evaluate."""
+        """Return one curve, or None if the official tool does not evaluate it."""
         return self.curves.get((class_name, metric, difficulty))
 
     def mean_ap(self, metric: str, difficulty: str) -> float | None:
-        """Mean R40 in percent over the evaluated classes of which any object counts; None without such a class."""
+        """Return the mean R40 in percent over evaluated classes with counted objects; None without such a class."""
         curves = [self.curve(name, metric, difficulty) for name in self.class_names]
         values = [curve.r40 for curve in curves if curve is not None and curve.counted]
         return float(np.mean(values)) if values else None
 
     def to_json(self) -> dict[str, Any]:
-        """Plain values: class -> metric -> None where not evaluated, else R11, R40 (percent), precision and counts.
+        """Return plain values: class -> metric -> None if not evaluated, else R11, R40 (percent), precision and counts.
 
         R11 and R40 list easy, moderate and hard; precision and counts are by difficulty.
         """
@@ -143,14 +143,14 @@ class KittiResults:
 
 @dataclass(frozen=True, eq=False)
 class KittiEvaluation:
-    """The results over everything, and in each distance band [low, high) in metres."""
+    """Results over all frames, and in each distance band [low, high) in metres."""
 
     overall: KittiResults
     bands: dict[_Band, KittiResults]
 
 
 def min_overlap(class_name: str) -> float:
-    """The overlap above which a detection of the class matches: 0.7 for Car, 0.5 for every other class."""
+    """Return the IoU above which a detection of the class matches: 0.7 for Car, 0.5 for every other class."""
     return MIN_OVERLAP.get(class_name.casefold(), OTHER_MIN_OVERLAP)
 
 
@@ -164,17 +164,17 @@ def evaluate(
 ) -> KittiEvaluation:
     """Evaluate detections by the protocol above.
 
-    A distance band is no part of the official protocol: there ground truth and detections of the class whose
+    Distance bands are not in the official protocol: there ground truth and detections of the class whose
     horizontal distance from the camera sqrt(x^2 + z^2) is outside [low, high) are ignored. A pair across the border
     is then neither true nor false, nor is its object missed. Detections without a 3D box are outside every band.
 
     Args:
-        truth: of each frame, DontCare areas and classes that are not evaluated included.
-        detections: of the same frames in the same order. The official tool skips frames without a detection file; a
-            frame in which nothing was detected has an empty one.
+        truth: labels of each frame, including DontCare areas and classes that are not evaluated.
+        detections: detections of the same frames in the same order. The official tool skips frames without a file; a
+            frame without detections has an empty one.
         class_names: compared without case.
-        bands_m: distance bands (low, high) in metres to evaluate besides.
-        reporter: of the progress.
+        bands_m: distance bands (low, high) in metres to evaluate in addition.
+        reporter: for the progress.
 
     Raises:
         ValueError: the two are not of the same frames, in the same order.
@@ -202,7 +202,7 @@ def evaluate(
 def _curves(
     frames: Frames, pairs: Pairs, dont_care: _Doubles, class_name: str, difficulty: str, band: _Band | None
 ) -> Iterator[Curve]:
-    """The curves of one class and difficulty in every metric that is evaluated."""
+    """Yield the curves of one class and difficulty in every evaluated metric."""
     truth, detections = frames.truth, frames.detections
     minimum = min_overlap(class_name)
     states = ClassStates(
@@ -228,10 +228,10 @@ def _curves(
 
 
 def _curve(class_name: str, metric: str, difficulty: str, counts: Counts, gains: NDArray[Any]) -> Curve:
-    """The curve of `gains` over what was reported at each threshold."""
+    """Return the curve of `gains` over the detections reported at each threshold."""
     reported = counts.tp + counts.fp
     precision = np.zeros(_RECALL_STEPS + 1)
-    # The official tool divides 0 by 0 in the rare case that everything at a threshold was used up by ignored objects.
+    # The official tool divides 0 by 0 in the rare case that all detections at a threshold match ignored objects.
     precision[: len(gains)] = gains / np.maximum(reported, 1)
     precision = np.maximum.accumulate(precision[::-1])[::-1]
     fields = (counts.counted, counts.matched, counts.thresholds, counts.tp, counts.fp, counts.fn)

@@ -1,4 +1,4 @@
-"""The report of KITTI's protocol: AP, AP by distance, recall and precision, as tables and as JSON."""
+"""Report of KITTI's protocol: AP, AP by distance, recall and precision, as tables and as JSON."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
@@ -23,10 +23,11 @@ BANDS_M = {
     (0.0, 30.0): "Table 3 of Deformable PV-RCNN",
     (30.0, 50.0): "Table 3 of Deformable PV-RCNN",
 }
-"""Bands of the distance from the camera, and who reports them; the ASCA paper gives the mean and no difficulty."""
+"""Bands of the distance from the camera, and papers that report them; the ASCA paper states the mean without a
+difficulty."""
 METRIC_TITLES = {"bbox": "2D", "bev": "BEV", "3d": "3D", "aos": "AOS"}
 SMALL_SET = 40
-"""With so few counted objects the protocol itself keeps a perfect detector below 100."""
+"""With so few counted objects the protocol's AP of a perfect detector is below 100."""
 _NONE = "-"
 
 
@@ -35,23 +36,23 @@ class KittiReport:
     """Result of an evaluation by KITTI's protocol, with all its numbers."""
 
     subject: str
-    """The model or folder and the data, in words."""
+    """Description of the model or folder and the data."""
     frames: ScoredFrames
     ap: KittiEvaluation
     points: Sequence[OperatingPoint]
     best_scores: dict[str, float]
-    """The score of each detected class that weighs misses against false detections best."""
+    """Score threshold with the best F1 of each detected class."""
     about: dict[str, Any]
     """Model, command, machine and versions, for the JSON."""
 
     @property
     def title(self) -> str:
-        """The subject, and how many frames stand behind the numbers."""
+        """Subject and number of frames."""
         return self.frames.titled(self.subject)
 
 
 def kitti_tables(report: KittiReport) -> list[TextTable]:
-    """AP, AP by distance, recall and precision at the fixed scores, and both by distance."""
+    """Return the tables of AP, AP by distance, recall and precision at the fixed scores, and both by distance."""
     whole = [point for point in report.points if point.band_m is None]
     recall = [(point, point.found, point.objects, point.recall, point.recall_interval) for point in whole]
     precision = [
@@ -67,9 +68,9 @@ def kitti_tables(report: KittiReport) -> list[TextTable]:
 
 
 def kitti_notes(report: KittiReport) -> list[str]:
-    """Notes for the reader of the tables.
+    """Return notes on the tables.
 
-    Types left out, classes not evaluated, sets too small for their AP, detections ignored, scores to choose.
+    Types left out, classes not evaluated, sets too small for their AP, ignored detections, best scores.
     """
     results = report.ap.overall
     lines = [_foreign_note(name, *counts) for name, counts in report.frames.foreign_types.items()]
@@ -91,7 +92,7 @@ def kitti_notes(report: KittiReport) -> list[str]:
 
 
 def kitti_json(report: KittiReport) -> dict[str, Any]:
-    """Everything in the report; `results` has the shape of KITTI's: class, metric, R11 / R40 / precision."""
+    """Return the whole report; `results` has the shape of KITTI's: class, metric, R11 / R40 / precision."""
     return {
         "subject": report.subject,
         "frames": len(report.frames),
@@ -157,19 +158,19 @@ def _share_table(
     columns: tuple[str, str],
     shares: Sequence[tuple[OperatingPoint, int, int, float, tuple[float, float]]],
 ) -> TextTable:
-    """Rows of (operating point, part, whole, share, interval)."""
+    """Return a table with rows of (operating point, part, whole, share, interval)."""
     rows = tuple(
         (point.class_name, point.difficulty, str(whole), str(part), *_percents(share, interval))
         for point, part, whole, share, interval in shares
     )
-    # A dictionary rather than a set keeps the order of the classes.
+    # A dictionary, unlike a set, keeps the order of the classes.
     fixed = dict.fromkeys(f"{p.class_name} {p.score:g} (IoU {p.min_overlap:g})" for p, *_ in shares)
     title = f"{what} (%) in 3D of what reaches the score: {', '.join(fixed)}"
     return TextTable(title, ("class", "difficulty", *columns, what.lower(), "95 % interval"), rows)
 
 
 def _share_band_table(points: Sequence[OperatingPoint]) -> TextTable:
-    """A row for each band, of a class recall and precision."""
+    """Return a table with a row for each band, and recall and precision of each class."""
     own = {(p.band_m, p.class_name): p for p in points if p.band_m is not None and p.difficulty == "moderate"}
     bands, names = (tuple(dict.fromkeys(keys)) for keys in zip(*own, strict=True)) if own else ((), ())
     rows = tuple(
@@ -191,18 +192,18 @@ def _share_cell(point: OperatingPoint) -> str:
 
 
 def _percents(share: float, interval: tuple[float, float]) -> tuple[str, str]:
-    if isnan(share):  # a share of nothing
+    if isnan(share):  # 0 / 0
         return _NONE, _NONE
     return _percent(100 * share), f"{100 * interval[0]:.2f} - {100 * interval[1]:.2f}"
 
 
 def _without_nan(values: dict[str, Any]) -> dict[str, Any]:
-    """JSON knows no NaN: a share of nothing is null."""
+    """Replace NaN, which JSON does not have, by None."""
     return {key: None if isinstance(value, float) and isnan(value) else value for key, value in values.items()}
 
 
 def _counts_of(results: KittiResults, name: str) -> Iterator[Curve | None]:
-    """For each difficulty a curve of the class, which knows the counted objects: the same for every metric."""
+    """Yield for each difficulty a curve of the class; counted objects are the same for every metric."""
     for difficulty in DIFFICULTIES:
         yield next((c for metric in METRICS if (c := results.curve(name, metric, difficulty))), None)
 

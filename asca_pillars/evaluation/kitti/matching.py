@@ -1,9 +1,9 @@
 """KITTI's assignment of detections to ground truth, for all frames and all score thresholds at once.
 
-Ground truth is processed in file order; each object takes the best detection that is still free. Inside a frame that is
+Ground truth is processed in file order; each object is matched to the best free detection. Within a frame this is
 sequential, but frames and thresholds are independent. So the first round matches the first object of every frame at
-every threshold, the next round the second ones; the number of rounds is that of the objects with a candidate in the
-fullest frame.
+every threshold, the next round the second ones; the number of rounds is the largest number of objects with a candidate
+in a frame.
 """
 
 from collections.abc import Iterator
@@ -25,8 +25,8 @@ class ClassStates(NamedTuple):
     Attributes:
         truth_states: (N,) `KittiState` of the ground truth.
         detection_states: (D,) `KittiState` of the detections.
-        scores: (D,) of the detections, any monotonic measure.
-        in_dont_care: (D,) detections that are not false positives though they match nothing.
+        scores: (D,) scores of the detections, any monotonic measure.
+        in_dont_care: (D,) detections that are not false positives even if unmatched.
     """
 
     truth_states: NDArray[np.int8]
@@ -40,11 +40,11 @@ class Counts:
     """True and false positives and missed objects at each of T score thresholds.
 
     Attributes:
-        counted: objects that count.
-        matched: how many of them the first pass matched with a counted detection.
+        counted: number of counted objects.
+        matched: number of those that the first pass matched with a counted detection.
         thresholds: (T,) scores, descending; T <= 41.
         tp, fp, fn: (T,).
-        similarity: (T,) sum over the true positives of what `count` was given for their pairs.
+        similarity: (T,) sum of the true positives' similarities passed to `count`.
     """
 
     counted: int
@@ -57,13 +57,13 @@ class Counts:
 
 
 def count(pairs: Pairs, metric: str, states: ClassStates, similarity: Floats, recall_steps: int) -> Counts:
-    """Both passes of the protocol: score thresholds at even steps of recall, then the counts at each of them.
+    """Compute score thresholds at even steps of recall, then the counts at each of them: the protocol's two passes.
 
     Args:
-        pairs: those that overlap enough for the class.
-        metric: whose overlap decides in the second pass.
-        similarity: (P,) of the headings of each pair.
-        recall_steps: steps into which the recall from 0 to 1 is cut.
+        pairs: pairs that overlap enough for the class.
+        metric: metric whose overlap is used in the second pass.
+        similarity: (P,) orientation similarity of each pair.
+        recall_steps: number of steps of recall from 0 to 1.
     """
     truth_states, detection_states = states.truth_states[pairs.truth], states.detection_states[pairs.detection]
     present = (truth_states != KittiState.ABSENT) & (detection_states != KittiState.ABSENT)
@@ -79,7 +79,7 @@ def count(pairs: Pairs, metric: str, states: ClassStates, similarity: Floats, re
     counted = int((states.truth_states == KittiState.COUNTED).sum())
     thresholds = score_thresholds(scores[taken & true], counted, recall_steps)
 
-    # Second pass: the greatest overlap among counted detections wins; an ignored one is the last resort.
+    # Second pass: the largest overlap among counted detections wins; an ignored one is used only without those.
     overlaps = np.where(detection_counted, pairs.overlaps[metric], 0.0)
     best = np.lexsort((pairs.detection, -overlaps, ~detection_counted, pairs.truth))
     found = assign(pairs, best, scores[:, None] >= thresholds)
@@ -122,17 +122,17 @@ def assign(pairs: Pairs, best: Ints, candidates: Mask) -> Mask:
 
 
 def score_thresholds(scores: Floats, counted: int, recall_steps: int) -> Floats:
-    """Those scores at which recall comes nearest to 0, 1 / recall_steps, 2 / recall_steps ...; descending.
+    """Return the scores at which recall is nearest to 0, 1 / recall_steps, 2 / recall_steps ...; descending.
 
     Args:
-        scores: (S,) of the matched objects, in any order.
-        counted: objects that recall 1 stands for, >= S.
+        scores: (S,) scores of the matched objects, in any order.
+        counted: number of objects at recall 1, >= S.
     """
     ranked = np.sort(scores)[::-1]
     chosen: list[float] = []
     recall = 0.0
     for index, score in enumerate(ranked.tolist(), start=1):
-        # The next score is nearer to the wanted recall than this one is; the last score has no next.
+        # The next score is nearer to the wanted recall than this one; the last score has no next.
         if index < len(ranked) and (index + 1) / counted - recall < recall - index / counted:
             continue
         chosen.append(score)
@@ -141,7 +141,7 @@ def score_thresholds(scores: Floats, counted: int, recall_steps: int) -> Floats:
 
 
 def _rounds(truth: Ints, frame: Ints) -> Iterator[tuple[Ints, Ints]]:
-    """The rows of each round, and where in them the rows of each ground truth begin.
+    """Yield the rows of each round, and the start of each ground truth's rows in them.
 
     Round k holds the k-th ground truth of every frame. `truth` and `frame` ascend: (P,), (P,).
     """
@@ -158,7 +158,7 @@ def _rounds(truth: Ints, frame: Ints) -> Iterator[tuple[Ints, Ints]]:
 
 
 def _first_true(mask: Mask, starts: Ints) -> Mask:
-    """The first true row of each run of rows, in every column: (R, T), starts of the G runs (G,) -> (R, T)."""
+    """Mark the first true row of each run of rows, in every column: (R, T), starts of the G runs (G,) -> (R, T)."""
     row = np.arange(len(mask), dtype=np.int32)[:, None]
     place = np.where(mask, row, np.int32(len(mask)))
     first = np.minimum.reduceat(place, starts, axis=0)

@@ -1,7 +1,7 @@
-"""The objects of a frame as arrays: what every metric here takes, for ground truth and detections alike.
+"""Objects of a frame as arrays, for ground truth and detections alike.
 
-Everything stands as KITTI's text files have it, in the rectified camera frame (x right, y down, z forward) and in
-pixels of the left color image, because KITTI's protocol judges 2D boxes beside 3D ones.
+Values are those of KITTI's text files, in the rectified camera frame (x right, y down, z forward) and in
+pixels of the left color image, because KITTI's protocol uses 2D boxes in addition to 3D ones.
 """
 
 from collections.abc import Sequence
@@ -17,7 +17,7 @@ from asca_pillars.geometry.arrays import Floats
 
 @dataclass(frozen=True, eq=False)
 class FrameObjects:
-    """The N objects of one frame, in the order of the file; N may be 0. All arrays are float64.
+    """N objects of one frame, in the order of the file; N may be 0. All arrays are float64.
 
     Attributes:
         frame_id: name of the frame's files, without ending.
@@ -27,12 +27,12 @@ class FrameObjects:
         dimensions_hwl: (N, 3) height, width, length in metres; -1 without a 3D box.
         locations: (N, 3) x, y, z of the *bottom* center in metres; -1000 without a 3D box.
         rotation_y: (N,) radians about the y axis, 0 when the object faces x.
-        truncated: (N,) 0..1. float32 will not do: float32(0.15) is above KITTI's limit of 0.15.
+        truncated: (N,) 0..1. float32 is not precise enough: float32(0.15) is above KITTI's limit of 0.15.
         occluded: (N,) 0, 1, 2 or 3; -1 where unknown.
         scores: (N,) of detections, any monotonic measure; 0 for ground truth.
 
     Raises:
-        ValueError: an array's shape does not fit the number of types, or it holds a value that is not finite.
+        ValueError: an array's shape does not fit the number of types, or it has a value that is not finite.
     """
 
     frame_id: str
@@ -61,7 +61,7 @@ class FrameObjects:
 
     @cached_property
     def folded_types(self) -> NDArray[np.str_]:
-        """(N,) type names without case, to compare with `name.casefold()`."""
+        """(N,) type names without case, for comparison with `name.casefold()`."""
         return np.array([name.casefold() for name in self.types], dtype=np.str_)
 
     @property
@@ -74,7 +74,7 @@ _ARRAYS = tuple(field.name for field in fields(FrameObjects) if field.name not i
 
 
 def frame_objects(frame_id: str, objects: Sequence[KittiObject]) -> FrameObjects:
-    """The lines of a label or detection file as arrays, in order; the score of a label is 0."""
+    """Convert the lines of a label or detection file to arrays, in order; the score of a label is 0."""
     rows = [
         (
             *(*item.bbox, item.alpha, item.height_m, item.width_m, item.length_m, item.x_m, item.y_m, item.z_m),
@@ -98,7 +98,7 @@ def frame_objects(frame_id: str, objects: Sequence[KittiObject]) -> FrameObjects
 
 
 def stacked(frames: Sequence[FrameObjects]) -> FrameObjects:
-    """The objects of all frames, one frame after the other, as if they were of one frame named ""."""
+    """Concatenate the objects of all frames, as one frame named ""."""
     if not frames:
         return frame_objects("", [])
     arrays = {name: np.concatenate([getattr(frame, name) for frame in frames], dtype=np.float64) for name in _ARRAYS}

@@ -1,10 +1,10 @@
-"""Recall and precision at a fixed score: what a user gets who runs the detector at its thresholds.
+"""Recall and precision at a fixed score, as for a detector run at its thresholds.
 
     recall = counted objects found / counted objects
     precision = true positives / (true positives + false positives)
 
-`score_threshold` says what counts and what matches, and how that departs from KITTI's AP. Recall in 3D at
-easy, moderate and hard is what Table 2 of AV PV-RCNN (2023) lists; the paper names no score. A distance band keeps the
+`score_threshold` defines counting and matching, and the differences to KITTI's AP. Recall in 3D at
+easy, moderate and hard is reported in Table 2 of AV PV-RCNN (2023), without a score. A distance band keeps the
 counted objects in it for the recall and the detections in it for the precision; it changes no match.
 """
 
@@ -20,24 +20,24 @@ from asca_pillars.evaluation.kitti.objects import FrameObjects
 from asca_pillars.evaluation.kitti.pairs import Frames
 from asca_pillars.evaluation.kitti.score_threshold import MatchInput, ScoreMatches, match_class
 
-Z_95 = 1.959964  # what a standard normal variable exceeds in 2.5 % of all cases
+Z_95 = 1.959964  # quantile of the standard normal distribution, 2.5 % above
 
 _Band = tuple[float, float]
 
 
 @dataclass(frozen=True)
 class OperatingPoint:
-    """Recall and precision of one class at one score, with Wilson's 95 % intervals; NaN is a share of nothing.
+    """Recall and precision of one class at one score, with Wilson's 95 % intervals; NaN for 0 / 0.
 
     Attributes:
-        min_overlap: intersection over union that a find must exceed.
+        min_overlap: IoU that a true positive must exceed.
         metric: "bev" or "3d".
         band_m: (low, high) of the horizontal distance from the camera in metres, or None for all.
-        objects: counted objects in the band, and
-        found: how many of them were found.
-        detections: detections in the band that are true or false positives, and
-        true_positives: how many of them match a counted object.
-        ignored: detections in the band that are neither.
+        objects: counted objects in the band.
+        found: number of found objects.
+        detections: true and false positives in the band.
+        true_positives: number of those that match a counted object.
+        ignored: other detections in the band.
     """
 
     class_name: str
@@ -68,14 +68,14 @@ def operating_points(
     difficulties: Sequence[str] = ("moderate",),
     bands_m: Sequence[_Band] = (),
 ) -> list[OperatingPoint]:
-    """Recall and precision for every class, difficulty and band, in that order; the band None comes first.
+    """Compute recall and precision for every class, difficulty and band, in that order; the band None comes first.
 
     Args:
         truth: labels of each frame.
-        detections: of the same frames, in the same order.
-        scores: the least score of a detection, for every class or the same for all.
-        min_overlap: intersection over union that a find must exceed, for every class; KITTI's if None.
-        bands_m: distance bands to report beside the whole.
+        detections: detections of the same frames, in the same order.
+        scores: the score threshold for every class or the same for all.
+        min_overlap: IoU that a true positive must exceed, for every class; KITTI's if None.
+        bands_m: distance bands to report in addition to the whole.
 
     Raises:
         ValueError: the frames differ, or `scores` or `min_overlap` lacks a class.
@@ -99,11 +99,11 @@ def best_scores(
     metric: Literal["bev", "3d"] = "3d",
     difficulty: str = "moderate",
 ) -> dict[str, float]:
-    """For every class the score with the highest F1, the harmonic mean of recall and precision.
+    """Return the score threshold of every class with the highest F1, the harmonic mean of recall and precision.
 
-    A class of which nothing was found is absent. Arguments and errors as for `operating_points`.
+    A class without a true positive is absent. Arguments and errors as for `operating_points`.
     """
-    # A detection's match depends on those of higher scores alone: one pass over all of them serves every score.
+    # A detection's match depends only on those of higher scores: one pass over all of them serves every threshold.
     inputs = MatchInput.of(truth, detections, class_names, -inf, min_overlap)
     best = {}
     for name in class_names:
@@ -119,18 +119,18 @@ def best_scores(
 
 
 def wilson_interval(hits: int, trials: int) -> tuple[float, float]:
-    """Wilson's score interval: the shares whose 95 % range holds `hits` of `trials`; (0, 1) without trials."""
+    """Compute Wilson's score interval: shares whose 95 % range contains `hits` of `trials`; (0, 1) without trials."""
     if not trials:
         return 0.0, 1.0
     share, slack = hits / trials, Z_95**2 / trials
     center = (share + slack / 2) / (1 + slack)
     reach = sqrt(slack * (share * (1 - share) + slack / 4)) / (1 + slack)
-    # Rounding would leave 0 of n just above 0, and n of n just below 1.
+    # Without min and max, rounding would give 0 of n a limit just above 0, and n of n one just below 1.
     return max(min(center - reach, share), 0.0), min(max(center + reach, share), 1.0)
 
 
 def _shares(matches: ScoreMatches, frames: Frames, band_m: _Band | None) -> tuple[Any, ...]:
-    """The counts and shares of an operating point, in its order."""
+    """Return the counts and shares of an operating point, in the order of its fields."""
     low, high = (0.0, inf) if band_m is None else band_m
     objects, found, true, false, ignored = (
         int((mask & (low <= items.distances_m) & (items.distances_m < high)).sum())

@@ -1,7 +1,7 @@
-"""Pairs of ground truth and detections that overlap, for all frames at once.
+"""Pairs of overlapping ground truth and detections, for all frames at once.
 
-Overlaps cost most of the time of an evaluation and depend on no class, difficulty or distance band: they are computed
-once, and only the few pairs are kept that overlap enough to match.
+Overlaps take most of the time of an evaluation and depend on no class, difficulty or distance band: they are computed
+once, and only the few pairs with enough overlap to match are kept.
 """
 
 from collections.abc import Iterator, Sequence
@@ -18,18 +18,18 @@ from asca_pillars.geometry.overlap import paired_bev_intersection
 _Doubles = NDArray[np.float64]
 _Indices = NDArray[np.int64]
 
-# Pairs looked at together: enough to keep NumPy busy, few enough that what is computed for them stays near 100 MB.
+# Pairs processed at once: enough for NumPy's efficiency, few enough for about 100 MB of temporary arrays.
 _BLOCK_PAIRS = 300_000
 
 
 @dataclass(frozen=True, eq=False)
 class Frames:
-    """F frames as one: the objects of all of them, and which belong together.
+    """F frames joined into one: all their objects, and the frame of each.
 
     Attributes:
-        truth, detections: of all frames, one after the other.
+        truth, detections: concatenated objects of all frames.
         truth_frames: (N,) index of the frame of each ground truth.
-        detection_starts: (F + 1,) where the detections of each frame begin, and where the last end.
+        detection_starts: (F + 1,) start of the detections of each frame, and end of the last.
     """
 
     truth: FrameObjects
@@ -39,7 +39,7 @@ class Frames:
 
     @classmethod
     def join(cls, truth: Sequence[FrameObjects], detections: Sequence[FrameObjects]) -> "Frames":
-        """The same frames twice, in the same order: once their ground truth, once their detections."""
+        """Join ground truth and detections of the same frames, in the same order."""
         frames = np.repeat(np.arange(len(truth)), [len(frame) for frame in truth])
         starts = np.cumsum([0, *(len(frame) for frame in detections)])
         return cls(stacked(truth), stacked(detections), frames, starts)
@@ -50,7 +50,7 @@ class Pairs:
     """P pairs of ground truth and detection of one frame, by ascending `truth`, then by ascending `detection`.
 
     Attributes:
-        truth, detection: (P,) indices into those of all frames.
+        truth, detection: (P,) indices into the objects of all frames.
         frame: (P,) index of the frame.
         overlaps: of each metric ("bbox", "bev", "3d"), (P,) intersection over union.
     """
@@ -61,17 +61,17 @@ class Pairs:
     overlaps: dict[str, _Doubles]
 
     def where(self, keep: NDArray[np.bool_]) -> "Pairs":
-        """Those pairs that a (P,) mask chooses."""
+        """Return the pairs in a (P,) mask."""
         overlaps = {metric: values[keep] for metric, values in self.overlaps.items()}
         return Pairs(self.truth[keep], self.detection[keep], self.frame[keep], overlaps)
 
 
 def overlapping_pairs(frames: Frames, wanted: NDArray[np.bool_], above: float, *, reporter: Reporter = SILENT) -> Pairs:
-    """The pairs whose boxes overlap by more than `above` in the image, from above or in 3D.
+    """Return the pairs whose boxes overlap by more than `above` in the image, in bird's-eye view or in 3D.
 
     Args:
-        wanted: (N,) which ground truth to pair.
-        reporter: of the progress.
+        wanted: (N,) mask of the ground truth to pair.
+        reporter: for the progress.
     """
     truth_boxes, detection_boxes = _upright_boxes(frames.truth), _upright_boxes(frames.detections)
     found = []
@@ -85,7 +85,7 @@ def overlapping_pairs(frames: Frames, wanted: NDArray[np.bool_], above: float, *
 
 
 def dont_care_shares(frames: Frames) -> _Doubles:
-    """(D,) largest share of each detection's image box that lies within one DontCare area of its frame."""
+    """Return the largest share (D,) of each detection's image box within one DontCare area of its frame."""
     shares = np.zeros(len(frames.detections))
     for truths in _blocks(frames, is_type(frames.truth, "DontCare")):
         pairs = _all_pairs(frames, truths)
@@ -95,7 +95,7 @@ def dont_care_shares(frames: Frames) -> _Doubles:
 
 
 def _blocks(frames: Frames, wanted: NDArray[np.bool_]) -> Iterator[_Indices]:
-    """The wanted ground truth, cut where the pairs with its frames' detections grow too many."""
+    """Yield the wanted ground truth in blocks with a limited number of pairs."""
     truths = np.flatnonzero(wanted)
     pairs = np.cumsum(np.diff(frames.detection_starts)[frames.truth_frames[truths]])
     cuts = np.flatnonzero(np.diff(pairs // _BLOCK_PAIRS)) + 1
@@ -103,7 +103,7 @@ def _blocks(frames: Frames, wanted: NDArray[np.bool_]) -> Iterator[_Indices]:
 
 
 def _all_pairs(frames: Frames, truths: _Indices) -> Pairs:
-    """Each of the ground truths with every detection of its frame; no overlaps yet."""
+    """Return each of the ground truths with every detection of its frame; without overlaps."""
     frame = frames.truth_frames[truths]
     starts = frames.detection_starts[frame]
     counts = frames.detection_starts[frame + 1] - starts
@@ -126,7 +126,7 @@ def _image_iou(a: _Doubles, b: _Doubles) -> _Doubles:
 
 
 def _image_intersection(a: _Doubles, b: _Doubles) -> _Doubles:
-    """Pixels shared by a[k] and b[k]: (P, 4), (P, 4) -> (P,). KITTI's evaluation adds no pixel to the sides."""
+    """Return pixels shared by a[k] and b[k]: (P, 4), (P, 4) -> (P,). As in KITTI's evaluation, no pixel is added."""
     width = np.minimum(a[:, 2], b[:, 2]) - np.maximum(a[:, 0], b[:, 0])
     height = np.minimum(a[:, 3], b[:, 3]) - np.maximum(a[:, 1], b[:, 1])
     return np.maximum(width, 0.0) * np.maximum(height, 0.0)
@@ -137,9 +137,9 @@ def _image_area(boxes: _Doubles) -> _Doubles:
 
 
 def _upright_boxes(objects: FrameObjects) -> _Doubles:
-    """(N, 7) x, z, *bottom* y, length, width, height, yaw: what `geometry.overlap` takes, in the camera's x-z plane.
+    """Return (N, 7) x, z, *bottom* y, length, width, height, yaw for `geometry.overlap`, in the camera's x-z plane.
 
-    rotation_y turns from x towards -z, against the yaw of that plane.
+    rotation_y rotates from x towards -z, against the yaw of that plane.
     """
     height, width, length = objects.dimensions_hwl.T
     x, y, z = objects.locations.T
@@ -147,15 +147,15 @@ def _upright_boxes(objects: FrameObjects) -> _Doubles:
 
 
 def _ground_iou(a: _Doubles, b: _Doubles) -> tuple[_Doubles, _Doubles]:
-    """Intersection over union of `_upright_boxes` a[k] and b[k] from above and in 3D: (P, 7), (P, 7) -> 2 x (P,)."""
+    """Return the IoU of `_upright_boxes` a[k] and b[k] in bird's-eye view and in 3D: (P, 7), (P, 7) -> 2 x (P,)."""
     bev, solid = np.zeros((2, len(a)))
     near = _circles_meet(a, b)
     a, b = a[near], b[near]
     shared = paired_bev_intersection(a, b)
     a_area, b_area = a[:, 3] * a[:, 4], b[:, 3] * b[:, 4]
     bev[near] = _ratio(shared, a_area + b_area - shared)
-    # y points down: a box spans bottom - height to bottom. Equal boxes share exactly their height, whatever rounding
-    # does to that difference.
+    # y points down: a box extends from bottom - height to bottom. Equal boxes share exactly their height, whatever the
+    # rounding of that difference.
     height = np.minimum(a[:, 2], b[:, 2]) - np.maximum(a[:, 2] - a[:, 5], b[:, 2] - b[:, 5])
     shared *= np.maximum(np.minimum(height, np.minimum(a[:, 5], b[:, 5])), 0.0)
     solid[near] = _ratio(shared, a_area * a[:, 5] + b_area * b[:, 5] - shared)
@@ -163,7 +163,7 @@ def _ground_iou(a: _Doubles, b: _Doubles) -> tuple[_Doubles, _Doubles]:
 
 
 def _circles_meet(a: _Doubles, b: _Doubles) -> NDArray[np.bool_]:
-    """Mask of the pairs that have footprints whose circumscribed circles meet; without a 3D box sizes are -1."""
+    """Return the mask of the pairs of footprints whose circumscribed circles meet; sizes without a 3D box are -1."""
     squared = np.square(a[:, 0] - b[:, 0]) + np.square(a[:, 1] - b[:, 1])
     reach = np.hypot(a[:, 3], a[:, 4]) + np.hypot(b[:, 3], b[:, 4])
     exist = np.min([a[:, 3], a[:, 4], b[:, 3], b[:, 4]], axis=0) > 0
@@ -172,6 +172,6 @@ def _circles_meet(a: _Doubles, b: _Doubles) -> NDArray[np.bool_]:
 
 
 def _ratio(part: _Doubles, whole: _Doubles) -> _Doubles:
-    """part / whole; 0 where there is nothing to share."""
+    """Return part / whole; 0 where the part is 0."""
     ratio: _Doubles = np.divide(part, whole, out=np.zeros_like(part), where=part > 0)
     return ratio

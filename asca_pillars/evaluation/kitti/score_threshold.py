@@ -1,17 +1,17 @@
-"""Matches of objects and detections when only detections of at least some score are reported.
+"""Matching of objects and detections with at least a given score.
 
-An object is counted or, beyond a limit of the difficulty or of a neighboring type, ignored, as KITTI has it (`states`).
-Each reported detection, the best score first, matches the free object of its class, counted or ignored, that it
-overlaps most, if that is more than the minimum. A matched object that counts is found, and its detection is a true
-positive.
+An object is counted or, beyond a limit of the difficulty or of a neighboring type, ignored, as in KITTI (`states`).
+Each reported detection, by descending score, is matched to the free object of its class, counted or ignored, with
+the largest overlap, if that is above the minimum. A matched object that is counted is found, and its detection is a
+true positive.
 
-A detection without a match is a false positive unless it is ignored: lower in the image than the difficulty asks for
-(objects so low need no label; nor do those outside the image, where detections have no 2D box), or more than half of
-its 2D box in one DontCare area. One that matches an ignored object is ignored too.
+An unmatched detection is a false positive unless it is ignored: lower in the image than the difficulty requires
+(such objects need no label; nor do those outside the image, where detections have no 2D box), or with more than half
+of its 2D box in one DontCare area. A detection that matches an ignored object is ignored too.
 
-This departs from KITTI's AP, which ranks by score over the whole set: there the objects choose among the detections, an
-object taken by a low detection (of whatever class) is neither found nor missed, DontCare areas count in 2D only, and
-what lies outside a distance band is ignored.
+This differs from KITTI's AP, which ranks by score over the whole set: there each object selects a detection, an
+object matched to a low detection (of any class) is neither found nor missed, DontCare areas apply in 2D only, and
+objects outside a distance band are ignored.
 """
 
 from collections.abc import Mapping, Sequence
@@ -32,7 +32,7 @@ from asca_pillars.evaluation.kitti.states import (
 )
 from asca_pillars.geometry.arrays import Mask
 
-DONT_CARE_SHARE = 0.5  # of a detection's 2D box: in one DontCare area, more makes it ignored
+DONT_CARE_SHARE = 0.5  # of a detection's 2D box in one DontCare area; with more it is ignored
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,12 +40,12 @@ class ScoreMatches:
     """Matches of N objects and D detections at a score threshold.
 
     Attributes:
-        frame_id: of the frame; "" for all frames together.
-        counted: (N,) objects that are to be found.
-        found: (N,) those of them that a detection matches.
+        frame_id: name of the frame; "" for all frames together.
+        counted: (N,) counted objects.
+        found: (N,) counted objects with a matched detection.
         reported: (D,) detections that reach the score.
         true_positive: (D,) reported detections that match a counted object.
-        false_positive: (D,) reported detections that match nothing and are not ignored.
+        false_positive: (D,) reported detections that are unmatched and not ignored.
     """
 
     frame_id: str
@@ -62,7 +62,7 @@ class ScoreMatches:
 
     @property
     def not_counted(self) -> Mask:
-        """(N,) mask of the objects that need not be found."""
+        """(N,) mask of the objects that are not counted."""
         return ~self.counted
 
     @property
@@ -83,7 +83,7 @@ def matches_at_score(
     *,
     scores: Mapping[str, float] | float,
 ) -> list[ScoreMatches]:
-    """The matches behind `operating_points`, frame by frame: all classes together, moderate, in 3D.
+    """Return the matches of `operating_points`, frame by frame: all classes together, moderate, in 3D.
 
     Raises:
         ValueError: the frames differ, or `scores` lacks a class.
@@ -100,14 +100,14 @@ def matches_at_score(
 
 @dataclass(frozen=True, eq=False)
 class MatchInput:
-    """All frames, and what depends on no difficulty: N objects and D detections, one frame after the other.
+    """All frames, and inputs independent of the difficulty: N objects and D detections, concatenated.
 
     Attributes:
-        frames: all of them as one.
-        pairs: objects and detections of one frame that overlap enough for some class.
-        in_dont_care: (D,) detections that lie in a DontCare area.
-        scores: of every class the least score of a detection.
-        min_overlap: of every class the intersection over union that a match must exceed.
+        frames: all frames joined.
+        pairs: pairs of objects and detections of one frame that overlap enough for some class.
+        in_dont_care: (D,) detections in a DontCare area.
+        scores: score threshold of every class.
+        min_overlap: IoU that a match must exceed, of every class.
 
     Raises:
         ValueError: from `of`, if the frames differ, or `scores` or `min_overlap` lacks a class.
@@ -128,7 +128,7 @@ class MatchInput:
         scores: Mapping[str, float] | float,
         min_overlap: Mapping[str, float] | None,
     ) -> "MatchInput":
-        """Overlaps and DontCare areas of the same frames, given in the same order; KITTI's minimum overlap if None."""
+        """Compute overlaps and DontCare areas of the same frames in the same order; KITTI's minimum overlap if None."""
         if [frame.frame_id for frame in truth] != [frame.frame_id for frame in detections]:
             raise ValueError("ground truth and detections must be of the same frames, in the same order")
         if min_overlap is None:
@@ -145,12 +145,12 @@ class MatchInput:
 
 
 def match_class(inputs: MatchInput, class_name: str, difficulty: str, metric: str) -> ScoreMatches:
-    """The matches of one class over all frames.
+    """Match one class over all frames.
 
     Args:
         inputs: N objects and D detections.
         difficulty: "easy", "moderate" or "hard".
-        metric: "bev" or "3d", whose overlap decides.
+        metric: "bev" or "3d", whose overlap is used.
     """
     objects, detections = inputs.frames.truth, inputs.frames.detections
     states = truth_states(objects, class_name, difficulty)

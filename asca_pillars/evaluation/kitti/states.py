@@ -1,7 +1,7 @@
 """Objects that KITTI counts, ignores, or treats as absent, per class and difficulty.
 
-An ignored object need not be found, but it takes a detection; an ignored detection is never false, but it takes an
-object. An absent one does neither.
+An ignored object need not be found, but can be matched; an ignored detection is never false, but can be matched. An
+absent one is neither.
 """
 
 from collections.abc import Mapping
@@ -23,7 +23,7 @@ class KittiState(IntEnum):
     IGNORED = 1
 
 
-# Types so like a class that finding one is no mistake, and missing one neither.
+# Types so similar to a class that detecting one is not an error, and missing one neither.
 NEIGHBORS: Mapping[str, str] = {name.casefold(): other.casefold() for name, other in NEIGHBOR_TYPES.items()}
 
 _Band = tuple[float, float]
@@ -45,13 +45,13 @@ LIMITS: Mapping[str, Limits] = {
 
 
 def is_type(objects: FrameObjects, name: str) -> NDArray[np.bool_]:
-    """(N,) mask of the objects of the named type, compared without case."""
+    """Return the mask (N,) of the objects of the named type, compared without case."""
     mask: NDArray[np.bool_] = objects.folded_types == name.casefold()
     return mask
 
 
 def is_neighbor(objects: FrameObjects, class_name: str) -> NDArray[np.bool_]:
-    """(N,) mask of the objects that are ignored beside the class: Van for Car, Person_sitting for Pedestrian."""
+    """Return the mask (N,) of the objects of the ignored neighbor type: Van for Car, Person_sitting for Pedestrian."""
     neighbor = NEIGHBORS.get(class_name.casefold())
     return np.zeros(len(objects), dtype=bool) if neighbor is None else is_type(objects, neighbor)
 
@@ -59,11 +59,11 @@ def is_neighbor(objects: FrameObjects, class_name: str) -> NDArray[np.bool_]:
 def truth_states(
     truth: FrameObjects, class_name: str, difficulty: str, band_m: _Band | None = None
 ) -> NDArray[np.int8]:
-    """(N,) the `KittiState` of each ground truth.
+    """Return the `KittiState` (N,) of each ground truth.
 
     Counted: of the class and within the difficulty's limits. Ignored: of the class but beyond a limit, or of its
-    neighboring type. Absent: every other type. In a distance band, what is counted but stands at a horizontal
-    distance outside [low, high) is ignored.
+    neighboring type. Absent: every other type. In a distance band, counted objects at a horizontal
+    distance outside [low, high) are ignored.
     """
     limits = LIMITS[difficulty]
     beyond = truth.bbox[:, 3] - truth.bbox[:, 1] < limits.min_height_px
@@ -76,11 +76,11 @@ def truth_states(
 def detection_states(
     detections: FrameObjects, class_name: str, difficulty: str, band_m: _Band | None = None
 ) -> NDArray[np.int8]:
-    """(N,) the `KittiState` of each detection.
+    """Return the `KittiState` (N,) of each detection.
 
     Ignored: lower in the image than the difficulty's minimum, *whatever the class*. Counted: otherwise, if of the
-    class. Absent: every other type. In a distance band, what is counted but stands at a horizontal distance outside
-    [low, high) is ignored.
+    class. Absent: every other type. In a distance band, counted detections at a horizontal distance outside
+    [low, high) are ignored.
     """
     low = np.abs(detections.bbox[:, 1] - detections.bbox[:, 3]) < LIMITS[difficulty].min_height_px
     own = is_type(detections, class_name)

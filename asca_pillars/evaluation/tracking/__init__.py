@@ -1,1 +1,1 @@
-"""Identities over time: HOTA and the CLEAR metrics."""
+"""Evaluation of tracking: HOTA and CLEAR MOT."""

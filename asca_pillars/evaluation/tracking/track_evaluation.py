@@ -1,4 +1,4 @@
-"""Evaluation of identities over time, from what `asca detect --track` wrote."""
+"""Evaluation of tracks written by `asca detect --track`."""
 
 from asca_pillars.base.errors import ConfigError
 from asca_pillars.base.system import describe_environment

@@ -10,16 +10,16 @@ from asca_pillars.geometry.arrays import Floats, Ints, Mask, Singles
 from asca_pillars.geometry.overlap import iou_3d
 
 IGNORED_IOU = 0.25
-"""A box that takes a label which is not counted, by so much overlap, is not counted either."""
+"""Least overlap by which a box that matches an uncounted label is not counted either."""
 
 
 class TrackedFrame(NamedTuple):
-    """One class in one frame: M labelled and N found identities, none twice."""
+    """One class in one frame: M labelled and N predicted identities, each unique."""
 
     objects: Ints
-    """(M,)."""
+    """(M,) labelled identities."""
     found: Ints
-    """(N,)."""
+    """(N,) predicted identities."""
     similarity: Floats
     """(M, N) in 0..1: 3D IoU."""
 
@@ -50,7 +50,7 @@ def tracked_frame(labels: Boxes, counted: Mask, found: Boxes) -> TrackedFrame:
 
 
 def counts_of_ids(frames: Sequence[TrackedFrame]) -> tuple[dict[int, int], dict[int, int]]:
-    """In how many frames each labelled and each found identity is."""
+    """Count the frames of each labelled and each predicted identity."""
     counts: tuple[dict[int, int], dict[int, int]] = ({}, {})
     for frame in frames:
         for own, ids in zip(counts, (frame.objects, frame.found), strict=True):
@@ -62,12 +62,12 @@ def counts_of_ids(frames: Sequence[TrackedFrame]) -> tuple[dict[int, int], dict[
 Pair = tuple[int, int]
 
 ALPHAS = np.arange(1, 20) / 20
-_EPSILON = 1e-3  # of the paper's matching score: parts the three aims
-_ROUNDING = 1e-9  # similarities that are a threshold but for rounding reach it
+_EPSILON = 1e-3  # of the paper's matching score: ranks the three criteria
+_ROUNDING = 1e-9  # tolerance of similarities at a threshold
 
 
 class Hota(NamedTuple):
-    """Means over ALPHAS, 0 to 1; NaN where there is neither a label nor a box."""
+    """Means over ALPHAS, 0 to 1; NaN without labels and boxes."""
 
     hota: float
     det_a: float
@@ -76,7 +76,7 @@ class Hota(NamedTuple):
 
 
 def hota(sequences: Sequence[Sequence[TrackedFrame]]) -> Hota:
-    """HOTA of one class over several sequences, whose identities have nothing to do with each other."""
+    """Compute HOTA of one class over several sequences with independent identities."""
     numbered = [_renumbered(frames, index) for index, frames in enumerate(sequences)]
     frames = [frame for own in numbered for frame in own]
     objects, found = counts_of_ids(frames)
@@ -89,7 +89,7 @@ def hota(sequences: Sequence[Sequence[TrackedFrame]]) -> Hota:
 def _at(
     alpha: float, frames: Sequence[TrackedFrame], objects: dict[int, int], found: dict[int, int]
 ) -> tuple[float, float, float, float]:
-    """HOTA, DetA, AssA and LocA at one threshold."""
+    """Compute HOTA, DetA, AssA and LocA at one threshold."""
     could_match = _pairs(frames, [frame.similarity >= alpha - _ROUNDING for frame in frames])
     association = {pair: _association(pair, count, objects, found) for pair, count in could_match.items()}
     matched: list[Mask] = []
@@ -133,7 +133,7 @@ def _pairs(frames: Sequence[TrackedFrame], masks: Sequence[Mask]) -> dict[Pair, 
 
 
 def _renumbered(frames: Sequence[TrackedFrame], sequence: int) -> list[TrackedFrame]:
-    """Identities that no other sequence has."""
+    """Return the frames with identities that are unique among all sequences."""
     return [
         frame._replace(objects=frame.objects + (sequence << 40), found=frame.found + (sequence << 40))
         for frame in frames
@@ -151,23 +151,23 @@ class ClearMot(NamedTuple):
 
     @property
     def misses(self) -> int:
-        """Labelled boxes that nothing was matched with."""
+        """Number of unmatched labelled boxes."""
         return self.labels - self.matches
 
     @property
     def mota(self) -> float:
-        """At most 1, may be negative; NaN without labels."""
+        """MOTA: at most 1, may be negative; NaN without labels."""
         wrong = self.misses + self.false_boxes + self.identity_switches
         return 1.0 - wrong / self.labels if self.labels else float("nan")
 
 
 def clear_mot(sequences: Sequence[Sequence[TrackedFrame]], threshold: float) -> ClearMot:
-    """The counts of one class over several sequences, matched from this similarity on."""
+    """Count the errors of one class over several sequences, matched from this similarity on."""
     total = np.zeros(5, np.int64)
     for frames in sequences:
-        last: dict[int, int] = {}  # object -> identity that it was last matched with
-        matched_before: dict[int, int] = {}  # the same, of the frame before alone
-        seen_before: dict[int, bool] = {}  # object -> matched in the last frame that it is labelled in
+        last: dict[int, int] = {}  # object -> identity of its last match
+        matched_before: dict[int, int] = {}  # the same, of the previous frame only
+        seen_before: dict[int, bool] = {}  # object -> matched in its last labelled frame
         for frame in frames:
             matches = _matches(frame, matched_before, threshold)
             for number in frame.objects.tolist():
@@ -183,7 +183,7 @@ def clear_mot(sequences: Sequence[Sequence[TrackedFrame]], threshold: float) -> 
 
 
 def _matches(frame: TrackedFrame, before: dict[int, int], threshold: float) -> dict[int, int]:
-    """Object -> identity."""
+    """Match a frame: object -> identity."""
     similarity = np.where(frame.similarity >= threshold, frame.similarity, 0.0)
     kept = np.array([[before.get(one) == other for other in frame.found.tolist()] for one in frame.objects.tolist()])
     if similarity.size:

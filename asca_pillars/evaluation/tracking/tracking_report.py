@@ -1,4 +1,4 @@
-"""Tracking metrics of a run over simulated (or otherwise labelled) sequences: HOTA, MOTA, switches, fragmentations."""
+"""Report of tracking metrics over labelled sequences: HOTA, MOTA, identity switches, fragmentations."""
 
 import json
 from collections import Counter
@@ -29,14 +29,14 @@ from asca_pillars.evaluation.tracking.tracking_metrics import (
 from asca_pillars.scans.find_scans import natural_order
 
 CLEAR_IOU = 0.25
-"""3D IoU from which on a box has found an object, for MOTA, switches and fragmentations."""
+"""Least 3D IoU of a match, for MOTA, identity switches and fragmentations."""
 MIN_POINTS = 5
-"""Labels of fewer points are not counted, where the dataset says how many there are."""
+"""Labels with fewer points are not counted, if the dataset states their number."""
 UNKNOWN_OCCLUSION = 3
 
 
 class ClassScore(NamedTuple):
-    """All metrics of one class."""
+    """Metrics of one class."""
 
     name: str
     hota: Hota
@@ -45,31 +45,31 @@ class ClassScore(NamedTuple):
 
 @dataclass(frozen=True)
 class TrackingReport:
-    """The scores, and how many labelled frames there are and have predictions."""
+    """Scores, and the numbers of labelled frames and of those with predictions."""
 
     subject: str
     scores: Sequence[ClassScore]
     frames: int
     frames_found: int
     not_scored: dict[str, int]
-    """Number of labels of each class that is not scored, because the detector does not know it."""
+    """Number of labels of each class that the detector does not have."""
     scope: DetectorScope | None
-    """Scope of the detector; None where the predictions do not state it."""
+    """Scope of the detector; None if the predictions do not state it."""
     outside: int
-    """Labels of the scored classes that are not counted because they lie outside its ranges."""
+    """Number of labels of the evaluated classes outside the detector's ranges, which are not counted."""
     hidden: int
-    """Labels of the scored classes within its ranges that are not counted because hardly anything is seen of them."""
+    """Number of labels of the evaluated classes within its ranges that are hardly visible and not counted."""
     about: dict[str, Any]
 
     @property
     def counted(self) -> int:
-        """Number of labels that count."""
+        """Number of counted labels."""
         return sum(one.clear.labels for one in self.scores)
 
 
 @dataclass(frozen=True)
 class _Frame:
-    """Boxes of all classes in one frame, labelled and found."""
+    """Boxes of all classes in one frame, labelled and predicted."""
 
     labels: Boxes
     types: tuple[str, ...]
@@ -81,17 +81,17 @@ class _Frame:
 
 
 def tracking_report(split: BoxSplit, predictions: Path, subject: str, about: dict[str, Any]) -> TrackingReport:
-    """Score the tracks that `asca detect --track` wrote.
+    """Score the tracks written by `asca detect --track`.
 
-    `predictions_by_frame` says which frame a line belongs to. Labelled frames without a line count as frames in which
-    nothing was found. Not counted are labels outside the ranges that the predictions state (`stated_scope`), of fewer
-    than MIN_POINTS points and of unknown occlusion. Scored are the detector's classes, which they state, too, and
+    Lines are assigned by `predictions_by_frame`. Labelled frames without a line count as frames without
+    detections. Not counted are labels outside the stated ranges of the detector (`stated_scope`), with fewer
+    than MIN_POINTS points and of unknown occlusion. Evaluated are the detector's stated classes, and
     those that are predicted.
 
     Args:
         split: labels with `track_id`; a frame's folder is its sequence.
         predictions: a .jsonl file, or the folder of one.
-        subject: in words.
+        subject: description of the tracks.
         about: for the JSON.
 
     Raises:
@@ -120,7 +120,7 @@ def tracking_report(split: BoxSplit, predictions: Path, subject: str, about: dic
 
 
 def tracking_tables(report: TrackingReport) -> list[TextTable]:
-    """HOTA with its parts, and MOTA with its counts; a row for each class."""
+    """Return the tables of HOTA with its parts, and of MOTA with its counts; a row for each class."""
     parts = [(one.name, *(f"{100 * value:.1f}" for value in one.hota)) for one in report.scores]
     counts = [
         (
@@ -138,7 +138,7 @@ def tracking_tables(report: TrackingReport) -> list[TextTable]:
 
 
 def tracking_notes(report: TrackingReport) -> list[str]:
-    """Notes for the reader of the numbers."""
+    """Return notes on the numbers."""
     notes = [
         "HOTA and its parts by 3D IoU, means over 0.05 to 0.95 (Luiten et al., 2021); MOTA, switches and fragments at "
         f"3D IoU {CLEAR_IOU:g}.",
@@ -170,7 +170,7 @@ def _counted_note(report: TrackingReport) -> str:
 
 
 def tracking_json(report: TrackingReport) -> dict[str, Any]:
-    """Every number; None for what cannot be computed."""
+    """Return all numbers; None for those that cannot be computed."""
     classes = {
         one.name: {
             key: None if isinstance(value, float) and np.isnan(value) else value
@@ -197,7 +197,7 @@ def tracking_json(report: TrackingReport) -> dict[str, Any]:
 
 
 def _of_class(frame: _Frame, name: str) -> TrackedFrame:
-    """One class of a frame; labels of other classes than those predicted take their boxes away."""
+    """Return one class of a frame; boxes that match labels of unpredicted classes are removed."""
     own = np.array([kind == name for kind in frame.types], bool)
     foreign = np.array([not counted and kind != name for kind, counted in zip(frame.types, frame.counted, strict=True)])
     rows = np.flatnonzero(own | foreign.astype(bool))
@@ -235,18 +235,18 @@ def _frame(
 
 
 def _label_records(split: BoxSplit, frame_id: str) -> list[dict[str, Any]]:
-    """A frame's label records with all their keys, where the frame has a file of its own."""
+    """Read a frame's label records with all their keys, if the frame has a file of its own."""
     path = split.labels_path / f"{frame_id}.json"
     return list(json.loads(read_text(path, DatasetError))["boxes"]) if path.is_file() else []
 
 
 def _number(value: Any, otherwise: float) -> float:
-    """A number that a label states beside its box; others' files may hold anything under the same key."""
+    """Return a label's extra number; in files of other programs the key may have any value."""
     return value if isinstance(value, int | float) else otherwise
 
 
 def _ids(values: Sequence[Any], place: str, numbers: dict[str, int]) -> NDArray[np.int64]:
-    """Identities (K,) as numbers: those that `numbers` has, and new ones for texts that it has not."""
+    """Return identities (K,) as numbers: those in `numbers`, and new ones for other texts."""
     if None in values:
         raise DatasetError(f"{place}: a box without `track_id`; write tracks with `asca detect --track`")
     texts = [str(value) for value in values]
@@ -256,7 +256,7 @@ def _ids(values: Sequence[Any], place: str, numbers: dict[str, int]) -> NDArray[
 
 
 def _in_order(frame_ids: Sequence[str], times: Mapping[str, float]) -> list[str]:
-    """As they followed each other: by time where every frame has one, else 2 before 10."""
+    """Return the frames in order: by time if every frame has one, else in natural order."""
     if all(frame_id in times for frame_id in frame_ids):
         return sorted(frame_ids, key=lambda frame_id: times[frame_id])
     return sorted(frame_ids, key=lambda frame_id: natural_order(Path(frame_id)))

@@ -1,6 +1,6 @@
-"""Decompression of recordings and of their chunks and messages, to no more than they state and than a limit.
+"""Decompression of recordings, their chunks and messages, up to the stated size and a limit.
 
-A few kilobytes can decompress to more than memory holds. The limit grows with the compressed size.
+A few kilobytes can decompress to more than fits into memory. The limit grows with the compressed size.
 """
 
 import shutil
@@ -15,9 +15,9 @@ from asca_pillars.scans.recordings.recording import reason
 
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 UNPACKERS = {".zstd": "zstd -d", ".zst": "zstd -d", ".bz2": "bunzip2", ".gz": "gunzip", ".lz4": "lz4 -d"}
-"""Suffixes of compressed files that are read, and the program that unpacks them."""
+"""Suffixes of compressed files that are supported, and the program that decompresses them."""
 MAX_BYTES, MAX_RATIO = 2**27, 32
-"""A message or a chunk of messages unpacks to the larger one of so many bytes and so many times its own length."""
+"""Largest decompressed size of a message or a chunk: this many bytes, or this many times its own length if more."""
 MAX_FILE_BYTES, MAX_FILE_RATIO = 2**28, 100
 _BLOCK_BYTES = 2**20
 _SHOWN_BYTES = 2**28  # compressed files from this size on show their progress
@@ -30,7 +30,7 @@ def decompress_file(source: Path) -> Path:
         path of the copy, which has the name of the file without its last suffix.
 
     Raises:
-        ScanError: the file is damaged at its start, unpacks to too much, or the disk is full.
+        ScanError: the file is damaged at its start, decompresses to too much, or the disk is full.
     """
     folder = Path(tempfile.mkdtemp(prefix="asca-unpacked-"))
     try:
@@ -39,7 +39,7 @@ def decompress_file(source: Path) -> Path:
         shutil.rmtree(folder, ignore_errors=True)
         if isinstance(error, ScanError) or not isinstance(error, Exception):
             raise
-        if isinstance(error, OSError) and error.errno is not None:  # gzip and bz2 say of damage that it is an OSError
+        if isinstance(error, OSError) and error.errno is not None:  # gzip and bz2 raise OSError for damage
             raise ScanError(
                 f"{source}: cannot be unpacked to {folder.parent} ({error.strerror}); set TMPDIR to a folder with room"
             ) from None
@@ -54,10 +54,10 @@ def decompress_zstd(data: bytes, size: int | None = None) -> bytes:
 
     Args:
         data: the frame.
-        size: bytes that it must unpack to; None: as many as the frame says.
+        size: expected decompressed bytes; None: as stated in the frame.
 
     Raises:
-        ValueError: it says or unpacks to another size, or to too much.
+        ValueError: the frame states or decompresses to another size, or to too much.
         Exception: it is damaged; zstandard has errors of its own.
     """
     from zstandard import ZstdDecompressor, frame_content_size
@@ -101,7 +101,7 @@ def _limit(packed_bytes: int) -> int:
 
 
 def _checked(stated: int | None, size: int | None, packed_bytes: int) -> int | None:
-    """The stated size; ValueError if it is not that, or too much."""
+    """Return the stated size; ValueError if it differs from the expected one, or is too large."""
     if size is not None and stated != size:
         raise ValueError(f"{stated} bytes where {size} are stated")
     if stated is not None and stated > _limit(packed_bytes):
@@ -122,13 +122,13 @@ def _within_limit(unpacked: bytes, packed_bytes: int) -> bytes:
 
 
 def _decompress_file(source: Path, target: Path) -> None:
-    """Decompress as much as is whole: whoever reads the copy says what is missing from its end."""
+    """Decompress the intact part: readers of the copy report what is missing at its end."""
     from zstandard import frame_content_size
 
     packed_bytes = source.stat().st_size
     limit = max(MAX_FILE_BYTES, MAX_FILE_RATIO * packed_bytes)
     with source.open("rb") as packed, target.open("wb") as unpacked:
-        # 18 bytes are the longest header of a frame of zstd.
+        # The longest header of a zstd frame has 18 bytes.
         stated = frame_content_size(packed.read(18)) if UNPACKERS[source.suffix.lower()] == "zstd -d" else -1
         _refuse_file(source, stated, limit)
         room = shutil.disk_usage(target.parent).free
@@ -145,7 +145,7 @@ def _decompress_file(source: Path, target: Path) -> None:
         ):
             task = progress.add_task(f"Unpacking {source.name}", total=packed_bytes)
             try:
-                while block := stream.read1(_BLOCK_BYTES):  # what is whole before damage, too
+                while block := stream.read1(_BLOCK_BYTES):  # also what is intact before damage
                     written += len(block)
                     _refuse_file(source, written, limit)
                     unpacked.write(block)
@@ -157,7 +157,7 @@ def _decompress_file(source: Path, target: Path) -> None:
 
 
 def _stream(packed: IO[bytes], suffix: str) -> Any:
-    """The unpacked bytes of a file, frame after frame where there are several."""
+    """Open a file for reading its decompressed bytes, across several frames."""
     if suffix == ".bz2":
         import bz2
 

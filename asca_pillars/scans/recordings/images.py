@@ -14,7 +14,7 @@ from asca_pillars.scans.recordings.recording import Message, Recording, Topic, l
 
 ImageKind = Literal["Image", "CompressedImage", "Foxglove"]
 IMAGE_REACH_NS = 500_000_000
-"""An image further from a scan than this, nanoseconds, does not show what the scan shows."""
+"""Largest difference in time between an image and its scan, nanoseconds."""
 
 _READ: tuple[tuple[str, ImageKind], ...] = (
     (r"sensor_msgs/(msg/)?Image", "Image"),
@@ -26,17 +26,17 @@ _PIXELS = {"mono8": "L", "rgb8": "RGB", "bgr8": "BGR", "rgba8": "RGBA", "bgra8":
 
 
 class CameraImage(NamedTuple):
-    """One image, and when it was taken, nanoseconds."""
+    """Image with its time stamp, nanoseconds."""
 
     time_ns: int
     content: bytes | NDArray[np.uint8]
-    """A file, or pixels (height, width, channels)."""
+    """Encoded file, or pixels (height, width, channels)."""
     kind: str
-    """`image/jpeg` or `image/png`; of pixels the order of the channels: L, RGB, BGR, RGBA or BGRA."""
+    """`image/jpeg` or `image/png`; for pixels the order of the channels: L, RGB, BGR, RGBA or BGRA."""
 
 
 def image_topics(recording: Recording) -> list[Topic]:
-    """The topics with images of types that are read, by name."""
+    """Return the topics with images of supported types, by name."""
     return [topic for topic in recording.topics if topic.messages and _kind_of(topic) is not None]
 
 
@@ -45,18 +45,18 @@ def _kind_of(topic: Topic) -> ImageKind | None:
 
 
 class NearestImages:
-    """The images of one topic, read once from its start to its end; no more than two of them are held.
+    """Images of one topic, read once from start to end; at most two of them are held.
 
     Args:
         recording: to read from.
         wanted: the topic's name; None: the first one with images.
 
     Attributes:
-        topic: that is read; None: the recording has no images.
-        others: all topics with images, where the first of several was taken.
-        shown: how many were given.
-        unreadable: how many could not be read.
-        trouble: why the first of these could not be read.
+        topic: the topic read; None: the recording has no images.
+        others: all topics with images, where the first of several was chosen.
+        shown: number of images returned.
+        unreadable: number of images that could not be read.
+        trouble: error of the first of these.
 
     Raises:
         ScanError: there are no images on a topic of that name.
@@ -77,9 +77,9 @@ class NearestImages:
         self._after: CameraImage | None = None
 
     def at(self, time_ns: int) -> CameraImage | None:
-        """The image nearest to a time, nanoseconds; None if there is none within IMAGE_REACH_NS.
+        """Return the image nearest to a time, nanoseconds; None if there is none within IMAGE_REACH_NS.
 
-        Times are to ascend, for images before the one given last are not read again.
+        Times must ascend: images before the last returned one are not read again.
         """
         if self._coming is None:
             self._coming = self._read()
@@ -94,7 +94,7 @@ class NearestImages:
         return self._before
 
     def remarks(self) -> list[str]:
-        """Sentences about what was left out; to be asked for at the end."""
+        """Return sentences about what was left out; call it at the end."""
         if self.topic is None:
             return []
         said = []
@@ -114,7 +114,7 @@ class NearestImages:
             for message in messages:
                 try:
                     image = read_image(message, kind)
-                except Exception as error:  # the library lets struct's and NumPy's errors pass
+                except Exception as error:  # the library does not catch struct's and NumPy's errors
                     self.unreadable += 1
                     self.trouble = self.trouble or reason(error)
                 else:
@@ -125,7 +125,7 @@ class NearestImages:
 
 
 def read_image(message: Message, kind: ImageKind) -> CameraImage:
-    """The image of a stored message.
+    """Decode the image of a stored message.
 
     Raises:
         Exception: it is damaged, or neither JPEG, PNG nor pixels of 8 bits.
@@ -144,7 +144,7 @@ def read_image(message: Message, kind: ImageKind) -> CameraImage:
 
 
 def _pixels(image: Any) -> tuple[NDArray[np.uint8], str]:
-    """The pixels of a sensor_msgs/Image without the padding of its rows, and the order of the channels."""
+    """Return the pixels of a sensor_msgs/Image without row padding, and the order of the channels."""
     if image.encoding not in _PIXELS:
         raise ValueError(f"its pixels are {image.encoding[:40]!r}; {', '.join(_PIXELS)} are read")
     order = _PIXELS[image.encoding]

@@ -1,4 +1,4 @@
-"""MCAP files, by the records of the format's own library; what cannot be read of one costs no more than that."""
+"""MCAP files, read with the records of the format's own library; damaged records are skipped."""
 
 import heapq
 import struct
@@ -29,15 +29,15 @@ _ENCODINGS: dict[str, Encoding] = {"cdr": "cdr", "ros1": "ros1", "json": "json",
 _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK = 3, 4, 5, 6  # opcodes
 _FIRST_PRIVATE = 0x80  # opcode
 _RECORD, _MESSAGE_HEAD = struct.Struct("<BQ"), struct.Struct("<HIQQ")
-_FOOTER_BYTES = 9 + 20 + 8  # with the magic that ends the file
+_FOOTER_BYTES = 9 + 20 + 8  # with the magic bytes at the end of the file
 _MAX_OTHER_RECORDS = 2**18
-"""Records of a chunk that are no messages; twice as many as there are numbers of channels and schemas."""
+"""Largest number of records of a chunk that are no messages; twice the number of possible channels and schemas."""
 _MAX_OPEN_BYTES = 2**28
-"""Chunks whose messages are merged by their times hold so many bytes; beyond, messages may be out of order."""
+"""Largest size of the chunks merged by time, bytes; beyond it, messages may be out of order."""
 
 
 class _Stored(NamedTuple):
-    """A message as it lies in the file."""
+    """Message as stored in the file."""
 
     log_time: int
     channel_id: int
@@ -45,7 +45,7 @@ class _Stored(NamedTuple):
 
 
 class _Known(NamedTuple):
-    """Schemas and channels by their numbers, as far as they have been read."""
+    """Schemas and channels read so far, by their numbers."""
 
     schemas: dict[int, Any]
     channels: dict[int, Any]
@@ -73,21 +73,21 @@ class _Known(NamedTuple):
 
 
 class McapRecording(Recording):
-    """One MCAP file.
+    """MCAP file.
 
     Args:
-        path: of the recording, for messages.
-        file: where it is read; None: at `path`.
+        path: path of the recording in error messages.
+        file: file to read; None: `path`.
 
     Raises:
-        ScanError: no MCAP, or nothing of it can be read.
+        ScanError: not an MCAP file, or nothing in it can be read.
     """
 
     def __init__(self, path: Path, file: Path | None = None) -> None:
         self.path, self._file = path, file or path
         self._known = _Known({}, {})
         self._chunks: list[Any] = []
-        """Indexes of chunks; empty where the records themselves are read, one after the other."""
+        """Indexes of chunks; empty where the records are read sequentially."""
         self._unread = 0  # chunks
         self._trouble: str | None = None
         with self._file.open("rb") as stream:
@@ -98,7 +98,7 @@ class McapRecording(Recording):
         self.topics = self._known.topics(counts)
 
     def messages(self, topic: str) -> Iterator[Message]:
-        """The messages of a topic, by time; of a file without an index by chunk, and by time within each."""
+        """Yield the messages of a topic by time; without an index by chunk, and by time within each."""
         self.damage, self._trouble, self._unread, count = None, None, 0, 0
         declared = sum(one.messages for one in self.topics if one.name == topic)
         with self._file.open("rb") as stream:
@@ -124,9 +124,9 @@ class McapRecording(Recording):
             self.damage = f"{self.path}: {of_them} messages of {topic} can be read"
 
     def _read_summary(self, stream: IO[bytes]) -> dict[int, int] | None:
-        """Read the index and what it says of the topics; the number of messages of each channel.
+        """Read the index, topics included; return the number of messages of each channel.
 
-        None if there is no whole summary: none at all, or one that lacks channels, schemas or chunks, for their
+        None without a complete summary: none at all, or one that lacks channels, schemas or chunks, for their
         repetition at the end is optional.
         """
         from mcap.records import ChunkIndex, Footer, Statistics
@@ -145,7 +145,7 @@ class McapRecording(Recording):
                     statistics = record
                 elif isinstance(record, ChunkIndex):
                     chunks.append(record)
-        except Exception:  # no end, or no MCAP: the records themselves tell
+        except Exception:  # no end, or not MCAP: decided by the records
             return None
         if statistics is None or not chunks:
             return None
@@ -159,7 +159,7 @@ class McapRecording(Recording):
         return counts
 
     def _count(self, stream: IO[bytes]) -> dict[int, int]:
-        """The number of messages of each channel of a file without an index, up to where it can be read."""
+        """Return the number of messages of each channel of a file without an index, up to where it can be read."""
         counts: Counter[int] = Counter()
         try:
             for record in self._records(stream):
@@ -181,7 +181,7 @@ class McapRecording(Recording):
                 yield _Stored(record.log_time, record.channel_id, record.data)
 
     def _records(self, stream: IO[bytes]) -> Iterator[Any]:
-        """Messages outside of chunks, and the unpacked records of each chunk; learns channels and schemas."""
+        """Yield messages outside of chunks and decompressed records of each chunk; store channels and schemas."""
         from mcap.records import Chunk
         from mcap.records import Message as McapMessage
         from mcap.stream_reader import StreamReader
@@ -235,7 +235,7 @@ class McapRecording(Recording):
         return self._unpacked(chunk)
 
     def _unpacked(self, chunk: Any) -> bytes | None:
-        """The records of a chunk; None, and it is noted, if it cannot be unpacked or is damaged."""
+        """Return the records of a chunk; None, and count it as unread, if it is damaged."""
         try:
             if chunk.compression == "zstd":
                 data = decompress_zstd(chunk.data, chunk.uncompressed_size)
@@ -260,7 +260,7 @@ class McapRecording(Recording):
         self._trouble = self._trouble or reason(error)
 
     def _sorted(self, data: bytes, topic: str) -> Iterator[_Stored]:
-        """The messages of a topic in a chunk, by time; only their places are held."""
+        """Yield the messages of a topic in a chunk, by time; only their offsets are held."""
         times, starts, ends, numbers = array("Q"), array("Q"), array("Q"), array("H")
         for number, start, end in self._messages_in(data, topic):
             times.append(_MESSAGE_HEAD.unpack_from(data, start)[2])
@@ -271,7 +271,7 @@ class McapRecording(Recording):
             yield _Stored(times[place], numbers[place], data[starts[place] : ends[place]])
 
     def _messages_in(self, data: bytes, topic: str | None = None) -> Iterator[tuple[int, int, int]]:
-        """Channel, start and end of messages in a chunk, as far as it can be read; learns channels and schemas."""
+        """Yield channel, start and end of messages in a chunk, up to damage; store channels and schemas."""
         channels = None if topic is None else self._known.channels_of(topic)
         position, others = 0, 0
         try:

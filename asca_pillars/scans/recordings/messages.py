@@ -1,4 +1,4 @@
-"""Messages of standard ROS types as objects, by the library rosbags."""
+"""Decoding of messages of standard ROS types, with the library rosbags."""
 
 from functools import cache
 from typing import Any
@@ -7,19 +7,19 @@ from asca_pillars.scans.recordings.decompression import ZSTD_MAGIC, decompress_z
 from asca_pillars.scans.recordings.recording import Encoding, Message
 
 _OTHER_TYPES = {
-    "tf2_msgs/msg/TFMessage": "geometry_msgs/TransformStamped[] transforms",  # ROS 1's common messages do not have it
+    "tf2_msgs/msg/TFMessage": "geometry_msgs/TransformStamped[] transforms",  # not among ROS 1's common messages
     "ouster_sensor_msgs/msg/PacketMsg": "uint8[] buf",
     "velodyne_msgs/msg/VelodynePacket": "builtin_interfaces/Time stamp\nuint8[1206] data",
     "velodyne_msgs/msg/VelodyneScan": "std_msgs/Header header\nvelodyne_msgs/VelodynePacket[] packets",
 }
-"""Types that are no part of the library's stores."""
+"""Types that the library does not define."""
 
 
 def decoded(message: Message, kind: str) -> Any:
-    """A stored message of a type such as sensor_msgs/msg/PointCloud2, by ROS' own definitions.
+    """Decode a stored message of a type such as sensor_msgs/msg/PointCloud2 by ROS' own definitions.
 
     Raises:
-        Exception: it is damaged; the library lets struct's and NumPy's errors pass.
+        Exception: it is damaged; the library does not catch struct's and NumPy's errors.
     """
     store = typestore(message.encoding)
     if message.encoding == "ros1":
@@ -30,17 +30,17 @@ def decoded(message: Message, kind: str) -> Any:
 
 
 def uncompressed(message: Message) -> bytes:
-    """The bytes of a message; rosbag2 says in its metadata.yaml alone that it compressed them.
+    """Return the bytes of a message; rosbag2 states its compression in its metadata.yaml alone.
 
     Raises:
         Exception: they are damaged.
     """
-    # No CDR begins so.
+    # CDR cannot begin with these bytes.
     return decompress_zstd(message.data) if message.data.startswith(ZSTD_MAGIC) else message.data
 
 
 def time_of(header: Any, message: Message) -> int | None:
-    """When a message was measured, nanoseconds: by its header, or where that says 0 or less when it was recorded.
+    """Return the time stamp of a message, nanoseconds: of its header, or if that is 0 or less of its recording.
 
     None if neither is known.
     """
@@ -50,7 +50,7 @@ def time_of(header: Any, message: Message) -> int | None:
 
 @cache
 def typestore(encoding: Encoding) -> Any:
-    """The standard definitions; those types that are read here have not changed since ROS 1."""
+    """Return the standard definitions; the types read here have not changed since ROS 1."""
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     store = get_typestore(Stores.ROS1_NOETIC if encoding == "ros1" else Stores.ROS2_HUMBLE)

@@ -1,4 +1,4 @@
-"""Where the car was at a time: the poses of a recording's nav_msgs/Odometry."""
+"""Poses of the vehicle from a recording's nav_msgs/Odometry, interpolated in time."""
 
 from dataclasses import dataclass
 
@@ -14,29 +14,29 @@ _Doubles = NDArray[np.float64]
 
 ODOMETRY_TYPES = ("nav_msgs/msg/Odometry", "nav_msgs/Odometry")
 
-_TOO_LARGE = 1e9  # of any number, metres: no map is a million kilometres wide
+_TOO_LARGE = 1e9  # of any number, metres: larger than any map
 
 BEYOND_NS = 200_000_000
-"""How long before the first and after the last pose a scan may be: as long as two at 10 Hz."""
+"""Largest time by which a scan may precede the first or follow the last pose: two scans at 10 Hz."""
 
 
 @dataclass(frozen=True)
 class Poses:
-    """N poses in the order of their times: of the odometry's child frame in a frame that stands still."""
+    """N poses by time, of the odometry's child frame in a fixed frame."""
 
     times_ns: NDArray[np.int64]
     """(N,) ascending."""
     positions_m: _Doubles
     """(N, 3)."""
     quaternions: _Doubles
-    """(N, 4) w, x, y, z of length 1, each the nearer one of two to that before."""
+    """(N, 4) w, x, y, z unit quaternions, of the two signs the one nearer to the pose before."""
 
     def covers(self, time_ns: int) -> bool:
-        """Whether a time lies between the first and the last pose, or hardly beyond."""
+        """Return whether a time is between the first and the last pose, up to BEYOND_NS."""
         return bool(self.times_ns[0] - BEYOND_NS <= time_ns <= self.times_ns[-1] + BEYOND_NS)
 
     def at(self, time_ns: int) -> _Doubles:
-        """The (4, 4) matrix, metres, at a time: between two poses by their shares, before and after all the nearest."""
+        """Return the (4, 4) matrix, metres, at a time: interpolated between two poses, outside of all the nearest."""
         after = int(np.clip(np.searchsorted(self.times_ns, time_ns), 1, max(len(self.times_ns) - 1, 1)))
         before = min(after - 1, len(self.times_ns) - 1)
         after = min(after, len(self.times_ns) - 1)
@@ -50,7 +50,7 @@ class Poses:
 
 
 def read_poses(recording: Recording, topic: str) -> Poses:
-    """All poses of a topic.
+    """Read all poses of a topic.
 
     Raises:
         ScanError: there is no such topic, it holds something else, or none of its poses can be used.
@@ -63,7 +63,7 @@ def read_poses(recording: Recording, topic: str) -> Poses:
     for message in recording.messages(topic):
         try:
             odometry = decoded(message, ODOMETRY_TYPES[0])
-        except Exception as error:  # the library lets struct's errors pass
+        except Exception as error:  # the library does not catch struct's errors
             trouble = reason(error)
             continue
         pose, time_ns = odometry.pose.pose, time_of(odometry.header, message)
@@ -71,7 +71,7 @@ def read_poses(recording: Recording, topic: str) -> Poses:
         row = [place.x, place.y, place.z, turn.w, turn.x, turn.y, turn.z]
         if time_ns is None:
             trouble = "no usable time stamp"
-        elif (np.abs(row) < _TOO_LARGE).all() and np.linalg.norm(row[3:]) > 0.5:  # not of NaN
+        elif (np.abs(row) < _TOO_LARGE).all() and np.linalg.norm(row[3:]) > 0.5:  # False for NaN
             rows.append((time_ns, row))
         else:
             trouble = "a pose that is not finite or too far away, or no rotation"

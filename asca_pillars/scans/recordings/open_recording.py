@@ -1,4 +1,4 @@
-"""Which paths are recordings, and opening them."""
+"""Detection and opening of recordings."""
 
 import shutil
 import weakref
@@ -27,14 +27,14 @@ _ROSBAG2_SUFFIXES = (".mcap", ".db3")
 
 
 def is_recording(path: Path) -> bool:
-    """Whether it is a recording by its name: a file, or a folder with the metadata.yaml or the files of rosbag2."""
+    """Return whether a path is a recording: by a file's name, or a folder's metadata.yaml or rosbag2 files."""
     if path.is_dir():
         return read_metadata(path) is not None or bool(_files(path))
     return _recorded_suffix(path) in RECORDING_SUFFIXES
 
 
 def recording_files(path: Path) -> list[Path]:
-    """The files that a recording consists of, sorted; a folder may hold others, such as results."""
+    """Return the files of a recording, sorted; a folder may contain others, such as results."""
     if not path.is_dir():
         return [path]
     names = METADATA_FILE, *(f"*{suffix}*" for suffix in _ROSBAG2_SUFFIXES)  # compressed ones have two suffixes
@@ -45,7 +45,7 @@ def open_recording(path: Path) -> Recording:
     """Open a recording.
 
     Raises:
-        ScanError: nothing is there, it cannot be read, or it lies among scans.
+        ScanError: it does not exist, cannot be read, or lies among scans.
     """
     if not path.exists():
         raise ScanError(f"{path}: no such file or folder; check the path")
@@ -64,7 +64,7 @@ def open_recording(path: Path) -> Recording:
 
 
 def _open_rosbag2(folder: Path, there: list[Path], metadata: BagMetadata) -> Recording:
-    """The files that are listed, or all if none of them is there; what is wrong with some does not lose the others."""
+    """Open the listed files, or all if none of them is there; errors in some do not lose the others."""
     by_name = {_unpacked_name(path.name): path for path in there}
     listed = {name: by_name.get(_unpacked_name(name)) for name in metadata.files}
     if packed := [name for name, file in listed.items() if file is None and (folder / name).is_file()]:
@@ -106,17 +106,17 @@ def _open_file(path: Path) -> Recording:
 
 
 def _recorded_suffix(path: Path) -> str:
-    """The suffix of a file, or if it is compressed the one before."""
+    """Return the suffix of a file, without that of its compression."""
     return Path(_unpacked_name(path.name)).suffix.lower()
 
 
 def _unpacked_name(name: str) -> str:
-    """The name of a file without the suffix of its compression."""
+    """Return the name of a file without the suffix of its compression."""
     return Path(name).stem if Path(name).suffix.lower() in UNPACKERS else name
 
 
 def _files(folder: Path) -> list[Path]:
-    """The files of rosbag2 in a folder, in natural order; of a compressed one and its unpacked copy the latter."""
+    """Return the rosbag2 files of a folder, in natural order; a decompressed copy replaces its compressed file."""
     found = [file for suffix in _ROSBAG2_SUFFIXES for file in visible_files(folder, f"*{suffix}*")]
     found = [file for file in found if _recorded_suffix(file) in _ROSBAG2_SUFFIXES and not file.is_dir()]
     plain = {file.name for file in found if file.name == _unpacked_name(file.name)}

@@ -1,4 +1,4 @@
-"""Messages of other makers' types: sensor_msgs/PointCloud, Livox' CustomMsg, foxglove.PointCloud and CompressedImage.
+"""Messages of other types: sensor_msgs/PointCloud, Livox' CustomMsg, foxglove.PointCloud and CompressedImage.
 
 The layouts are those of their public definitions (common_interfaces, livox_ros_driver2, foxglove/schemas).
 """
@@ -26,7 +26,7 @@ _REFLECTANCE = ("intensity", "intensities", "reflectance", "reflectivity", "i")
 
 
 def point_cloud(message: Message) -> tuple[Any, StoredPoints]:
-    """Header and points of a stored sensor_msgs/PointCloud.
+    """Return header and points of a stored sensor_msgs/PointCloud.
 
     Raises:
         Exception: it is damaged.
@@ -42,7 +42,7 @@ def point_cloud(message: Message) -> tuple[Any, StoredPoints]:
 
 
 def livox_cloud(message: Message) -> tuple[Any, StoredPoints]:
-    """Header and points of a stored livox_ros_driver/CustomMsg; reflectivities are 0..255.
+    """Return header and points of a stored livox_ros_driver/CustomMsg; reflectivities are 0..255.
 
     Raises:
         Exception: it is damaged.
@@ -58,7 +58,7 @@ def livox_cloud(message: Message) -> tuple[Any, StoredPoints]:
             raise ValueError("its numbers are big-endian")
         sec, nanosec, length = struct.unpack_from("<iII", data, 4)
         name, stride = 16, 20
-        start = 4 + -(-(name + length - 4) // 8) * 8 + 8 + 4 + 4  # uint64 lies at a multiple of 8 behind the 4 of CDR
+        start = 4 + -(-(name + length - 4) // 8) * 8 + 8 + 4 + 4  # uint64 is aligned, 4 bytes of CDR first
         (count,) = struct.unpack_from("<I", data, start)
     first = start + 4
     if count > MAX_POINTS or (count and len(data) < first + (count - 1) * stride + 19):
@@ -75,14 +75,14 @@ def livox_cloud(message: Message) -> tuple[Any, StoredPoints]:
 
 
 def packed_points(message: Message) -> tuple[Any, StoredPoints]:
-    """Header and points of a revolution as `packet_files` puts it into a message."""
+    """Return header and points of a revolution, in the message format of `packet_files`."""
     table = np.frombuffer(message.data, _FLOAT).reshape(-1, 4)
     header = SimpleNamespace(stamp=SimpleNamespace(sec=0, nanosec=0), frame_id="")
     return header, StoredPoints(table[:, :3], table[:, 3], _FLOAT)
 
 
 def foxglove_cloud(message: Message) -> Any:
-    """A stored foxglove.PointCloud, JSON or Protobuf, as an object with the fields of PointCloud2, and a `pose`.
+    """Decode a foxglove.PointCloud, JSON or Protobuf, as an object with the fields of PointCloud2, and a `pose`.
 
     Raises:
         Exception: it is damaged.
@@ -105,7 +105,7 @@ def foxglove_cloud(message: Message) -> Any:
 
 
 def foxglove_image(message: Message) -> Any:
-    """A stored foxglove.CompressedImage, JSON or Protobuf, as an object with the fields of sensor_msgs/CompressedImage.
+    """Decode a foxglove.CompressedImage, JSON or Protobuf, as an object like sensor_msgs/CompressedImage.
 
     Raises:
         Exception: it is damaged.
@@ -123,9 +123,9 @@ def foxglove_image(message: Message) -> Any:
 
 
 def posed(points: StoredPoints, pose: Any) -> StoredPoints:
-    """The points (N, 3) in the frame that a foxglove.Pose, (x, y, z, w, x, y, z), places them in."""
+    """Transform points (N, 3) by a foxglove.Pose, (x, y, z, w, x, y, z)."""
     shift, turn = np.array(pose[:3], float), np.array(pose[3:], float)
-    if not np.linalg.norm(turn):  # left out
+    if not np.linalg.norm(turn):  # not given
         turn = np.array([1.0, 0, 0, 0])
     matrix = of_quaternions(turn)
     if np.array_equal(matrix, np.eye(3)) and not shift.any():
@@ -181,7 +181,7 @@ def _double(fields: dict[int, Any], key: int) -> float:
 
 
 def _wire(data: bytes) -> Iterator[tuple[int, Any]]:
-    """Number and value of each field of a Protobuf message: whole numbers, or bytes of any other kind."""
+    """Yield number and value of each field of a Protobuf message: integers, or bytes of any other type."""
     position = 0
     while position < len(data):
         key, position = _varint(data, position)

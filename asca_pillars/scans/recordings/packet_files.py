@@ -1,7 +1,7 @@
-"""Captures of a sensor's packets (`.pcap`), cut into scans of one revolution by the libraries that know the packets.
+"""Packet captures of a sensor (`.pcap`), split into scans of one revolution by the vendors' libraries.
 
-Ouster's by its maker's `ouster-sdk`, with the sensor's metadata in a `.json` beside the capture, whose name is the
-capture's or its beginning; Velodyne's by `velodyne-decoder`.
+Ouster: `ouster-sdk`, with the sensor's metadata in a `.json` in the same folder, whose name is the capture's or its
+beginning; Velodyne: `velodyne-decoder`.
 """
 
 import math
@@ -25,20 +25,20 @@ PACKET_MSG = "ouster_sensor_msgs/msg/PacketMsg"
 _TOPIC = "/packets"
 _VELODYNE_BYTES = 1206  # of a packet of points
 _LOOKED_AT = 1000
-"""Packets that are looked at for those of a Velodyne: others, such as positions, may lie between them."""
+"""Packets searched for those of a Velodyne: others, such as positions, may lie between them."""
 
 
 class PacketCapture(Recording):
-    """A `.pcap` of one sensor. Its messages hold (N, 4) float32 x, y, z in metres and reflectance 0..1.
+    """`.pcap` file of one sensor. Its messages hold (N, 4) float32 x, y, z in metres and reflectance 0..1.
 
-    Their times are those at which the capturing computer got the first packet of each revolution.
+    Their time stamps are those of the first packet of each revolution at the capturing computer.
 
     Args:
-        path: of the capture, for messages.
-        file: where it is read; None: at `path`.
+        path: path of the capture in error messages.
+        file: file to read; None: `path`.
 
     Raises:
-        ScanError: no capture of a sensor that is known, or one without its metadata.
+        ScanError: not a capture of a supported sensor, or its metadata are missing.
     """
 
     def __init__(self, path: Path, file: Path | None = None) -> None:
@@ -50,7 +50,7 @@ class PacketCapture(Recording):
         self.topics = [Topic(_TOPIC, self._type, sum(1 for _ in self.messages(_TOPIC)))]
 
     def messages(self, topic: str) -> Iterator[Message]:
-        """The revolutions, up to where the capture breaks off."""
+        """Yield the revolutions, up to where the capture is cut off."""
         self.damage, count = None, 0
         revolutions = self._velodyne() if self._type == VELODYNE else self._ouster()
         try:
@@ -63,7 +63,7 @@ class PacketCapture(Recording):
             self.damage = f"{self.path}: ends early, after {count} scans ({reason(error)})"
 
     def _payloads(self) -> Iterator[tuple[float, bytes]]:
-        """Time and content of each UDP packet."""
+        """Yield time and content of each UDP packet."""
         import dpkt
 
         with self._file.open("rb") as stream:
@@ -99,7 +99,7 @@ class PacketCapture(Recording):
                 if len(payload) == _VELODYNE_BYTES and (scan := decoder.decode(time_s, payload)) is not None:
                     yield _of_velodyne(scan)
         finally:
-            last = decoder.finish()  # what lies before a tear, too
+            last = decoder.finish()  # also what precedes a damaged packet
         if last is not None:
             yield _of_velodyne(last)
 
@@ -115,21 +115,21 @@ class PacketCapture(Recording):
 
 
 class OusterPackets:
-    """The revolutions in a recording's topic of PacketMsg, by the metadata on the topic beside it.
+    """Revolutions of a recording's topic of PacketMsg, decoded with the metadata topic next to it.
 
     Args:
         recording: to read from.
-        topic: of the packets, such as /ouster/lidar_packets.
+        topic: topic of the packets, such as /ouster/lidar_packets.
 
     Attributes:
-        revolutions: about how many there are.
+        revolutions: their approximate number.
 
     Raises:
-        ScanError: the metadata are not there, or cannot be read.
+        ScanError: the metadata are missing, or cannot be read.
     """
 
     frame_id = "os_sensor"
-    """As the sensor's driver calls the frame of its points, for the packets name none."""
+    """Frame of the points in the sensor's driver; the packets name none."""
 
     def __init__(self, recording: Recording, topic: Topic) -> None:
         require("packets")
@@ -150,7 +150,7 @@ class OusterPackets:
         self.revolutions = math.ceil(topic.messages / packets)
 
     def messages(self) -> Iterator[Message]:
-        """Revolutions as of `PacketCapture.messages`; packets that cannot be read are left out, like lost ones."""
+        """Yield revolutions as `PacketCapture.messages`; unreadable packets are left out, like lost ones."""
         from ouster.sdk import core
 
         table = core.XYZLut(self._info, use_extrinsics=False)
@@ -158,7 +158,7 @@ class OusterPackets:
         for message in self._recording.messages(self._topic):
             try:
                 payload = np.asarray(decoded(message, PACKET_MSG).buf, np.uint8)
-            except Exception:  # the library lets struct's and NumPy's errors pass
+            except Exception:  # the library does not catch struct's and NumPy's errors
                 continue
             if len(payload) < self._format.lidar_packet_size:
                 continue
@@ -174,7 +174,7 @@ class OusterPackets:
 
 
 def velodyne_scan(message: Message) -> tuple[Any, StoredPoints]:
-    """Header and points of a stored velodyne_msgs/VelodyneScan, which holds the packets of a revolution.
+    """Return header and points of a stored velodyne_msgs/VelodyneScan, which holds the packets of a revolution.
 
     Raises:
         Exception: it is damaged, or its packets are.
@@ -193,7 +193,7 @@ def velodyne_scan(message: Message) -> tuple[Any, StoredPoints]:
 
 
 def _metadata_beside(path: Path) -> Path:
-    """The `.json` whose name the capture's name is or begins with, the longest of them."""
+    """Return the `.json` with the longest name that equals or begins the capture's name."""
     name = path.name.partition(".pcap")[0]
     beside = [one for one in visible_files(path.parent, "*.json") if name.startswith(one.stem)]
     if not beside:

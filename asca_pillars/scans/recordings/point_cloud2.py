@@ -12,28 +12,28 @@ from asca_pillars.scans.recordings.recording import Message, reason
 from asca_pillars.scans.recordings.scan_types import ScanKind
 from asca_pillars.scans.records import MAX_POINTS, Field, StoredPoints, assemble_points, select_fields
 
-# sensor_msgs/PointField: datatype 1 to 8.
+# sensor_msgs/PointField: datatypes 1 to 8.
 _DATATYPES = ("i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8")
 
 
 class PointCloud(NamedTuple):
-    """The points of a message, when they were measured, and in which frame."""
+    """Points of a message, with their time stamp and frame."""
 
     points: StoredPoints
     time_ns: int
-    """The header's time, or if that is 0 or less the recording's; 0, with a remark, if neither is usable."""
+    """Time stamp of the header, or if that is 0 or less of the recording; 0, with a remark, if neither is usable."""
     frame_id: str
     fields: tuple[str, ...] = ()
-    """Names of the fields of a point, where the message lists them."""
+    """Names of a point's fields, where the message lists them."""
 
 
 def read_point_cloud(message: Message, source: str, kind: ScanKind = "PointCloud2") -> PointCloud:
-    """The points of a stored message.
+    """Read the points of a stored message.
 
     Args:
-        message: of a topic of scans.
-        source: names it in errors.
-        kind: of its type.
+        message: from a topic of scans.
+        source: name in errors.
+        kind: message type.
 
     Raises:
         ScanError: the message is damaged or contradicts itself, or has no x, y and z.
@@ -44,7 +44,7 @@ def read_point_cloud(message: Message, source: str, kind: ScanKind = "PointCloud
         header, points, fields = _read(message, source, kind)
     except ScanError:
         raise
-    except Exception as error:  # the library lets struct's and NumPy's errors pass
+    except Exception as error:  # the library does not catch struct's and NumPy's errors
         name = kind if kind.startswith("Point") else f"point cloud of {kind}"
         raise ScanError(f"{source}: no readable {name} ({reason(error)}); record it again") from None
     time_ns = time_of(header, message)
@@ -55,7 +55,7 @@ def read_point_cloud(message: Message, source: str, kind: ScanKind = "PointCloud
 
 
 def _read(message: Message, source: str, kind: ScanKind) -> tuple[Any, StoredPoints, tuple[str, ...]]:
-    """Header, points, and the names of the fields where the message lists them."""
+    """Return header, points, and the names of the fields where the message lists them."""
     if kind == "Packets":
         return *packed_points(message), ()
     if kind == "Velodyne":
@@ -70,11 +70,11 @@ def _read(message: Message, source: str, kind: ScanKind) -> tuple[Any, StoredPoi
 
 
 def point_cloud_points(cloud: Any, source: str) -> StoredPoints:
-    """The points of a PointCloud2 that was decoded by rosbags or came from ROS.
+    """Read the points of a PointCloud2 that was decoded by rosbags or received from ROS.
 
     Args:
         cloud: an object with the fields of that message.
-        source: names it in errors.
+        source: name in errors.
 
     Raises:
         ScanError: the message contradicts itself, or has no x, y and z.
@@ -103,8 +103,8 @@ def point_cloud_points(cloud: Any, source: str) -> StoredPoints:
     if not count:
         return assemble_points(0, [np.zeros(0, field.dtype) for field in chosen], chosen)
     if height == 1 or len(data) == count * step:
-        row_step = width * step  # there is no padding, whatever drivers write here: the whole cloud, the width, 0
-    # The last row may come without its padding.
+        row_step = width * step  # no padding, whatever a driver writes here: the size of the cloud, the width or 0
+    # The last row may lack its padding.
     if row_step < width * step or len(data) < (height - 1) * row_step + width * step:
         raise ScanError(
             f"{source}: {len(data)} bytes where {height} x {width} points of {step} bytes in rows of {row_step} "

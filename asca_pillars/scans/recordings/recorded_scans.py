@@ -1,4 +1,4 @@
-"""The scans of a recording's topic, one after the other, with time stamps; those that cannot be read are counted."""
+"""Scans of a recording's topic with time stamps, in order; unreadable ones are counted."""
 
 from collections.abc import Iterator
 from itertools import islice
@@ -20,15 +20,15 @@ from asca_pillars.scans.stored_scans import FolderScale, common_reflectance_scal
 from asca_pillars.scans.transforms import Transforms, read_static_transforms
 
 SEARCHED_MESSAGES = 300
-"""How far scans with points are looked for: half a minute at 10 Hz, in which a sensor starts."""
+"""Messages searched for scans with points: half a minute at 10 Hz, in which a sensor starts."""
 MAX_UNREADABLE = 10_000
-"""Messages in a row that cannot be read, after which no more are tried: a quarter of an hour at 10 Hz."""
+"""Consecutive unreadable messages after which reading stops: a quarter of an hour at 10 Hz."""
 
 
 class RecordedScan(NamedTuple):
-    """One message of the topic: its number, its time, and its scan or why there is none.
+    """Message of the topic: its number, its time, and its scan or the reason why there is none.
 
-    `fields` are the names of the fields of a point, where the message lists them.
+    `fields` are the names of a point's fields, where the message lists them.
     """
 
     number: int
@@ -40,16 +40,17 @@ class RecordedScan(NamedTuple):
 
 
 class RecordedScans:
-    """The scans of one topic.
+    """Scans of one topic.
 
     Args:
         recording: to read from.
-        topic: of point clouds, or of an Ouster's packets.
-        reflectance_scale: the stored value that is a reflectance of 1; auto: by the first scans with points, once.
-        frame: that the points are taken into, by the recording's static transforms; None: they stay in their own.
+        topic: topic of point clouds, or of an Ouster's packets.
+        reflectance_scale: the stored value that is a reflectance of 1; auto: decided once, by the first scans with
+            points.
+        frame: target frame of the points, by the recording's static transforms; None: their own.
 
     Attributes:
-        scale: what was decided.
+        scale: the decided scale.
 
     Raises:
         ScanError: there are no static transforms, or they do not name `frame`.
@@ -74,16 +75,16 @@ class RecordedScans:
             self.scale = FolderScale(reflectance_scale, None)
 
     def first(self, count: int) -> Iterator[Scan]:
-        """The first scans with points, at most `count`; none is looked for beyond SEARCHED_MESSAGES."""
+        """Return an iterator over at most `count` first scans with points, among SEARCHED_MESSAGES messages."""
         return (finite_scan(cloud.points, self.scale.scale) for cloud in self._first(count))
 
     def samples(self) -> Iterator[NamedPoints]:
-        """Up to SEARCHED_SCANS of the first scans with points, to estimate the sensor's height from."""
+        """Yield up to SEARCHED_SCANS of the first scans with points, for estimating the sensor's height."""
         for number, scan in enumerate(self.first(SEARCHED_SCANS), start=1):
             yield NamedPoints(f"scan {number} with points of {self.topic.name}", scan.points)
 
     def mounting(self, reading: ScanSettings) -> tuple[Mounting, list[str]]:
-        """The sensor's mounting, with a height of "auto" by the first scans, and what a user is to know.
+        """Return the sensor's mounting, with a height of "auto" from the first scans, and messages for the user.
 
         Raises:
             ConfigError, ScanError: as `ScanSettings.mounting`.
@@ -95,7 +96,7 @@ class RecordedScans:
         return mounting, said
 
     def read(self, start: int = 0) -> Iterator[RecordedScan]:
-        """All scans from message `start` on; what damage ends the recording early, `recording.damage` tells."""
+        """Yield all scans from message `start` on; see `recording.damage` if damage ends the recording early."""
         unreadable = 0
         for number, message in enumerate(self._messages()):
             if number < start:
@@ -123,7 +124,7 @@ class RecordedScans:
             try:
                 cloud = self._cloud(number, message)
             except ScanError:
-                continue  # named when its turn comes
+                continue  # reported when it is read
             if has_finite_point(cloud.points):
                 yield cloud
 

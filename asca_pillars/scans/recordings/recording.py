@@ -1,4 +1,4 @@
-"""What all kinds of recordings have in common: topics, and the messages of one of them."""
+"""Base class of recordings: topics, and the messages of one of them."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Sequence
@@ -13,14 +13,14 @@ Encoding = Literal["cdr", "ros1", "json", "protobuf", "points"]
 
 
 UNKNOWN_TYPE = "unknown"
-"""The type of a topic without a schema."""
+"""Type of a topic without a schema."""
 SEVERAL_TYPES = "several types"
 LAST_NS = 2**63 - 1
-"""The latest time that is usable: in 2262."""
+"""Latest usable time: in 2262."""
 
 
 class Topic(NamedTuple):
-    """A topic, the type of its messages as ROS writes it, and how many there are."""
+    """Topic with the type of its messages in ROS notation, and their number."""
 
     name: str
     type: str
@@ -33,7 +33,7 @@ class Topic(NamedTuple):
 
 
 class Message(NamedTuple):
-    """A message as it is stored, and when it was recorded, nanoseconds; None where no usable time is stored."""
+    """Message as stored, and when it was recorded, nanoseconds; None where no usable time is stored."""
 
     recorded_ns: int | None
     data: bytes
@@ -41,12 +41,12 @@ class Message(NamedTuple):
 
 
 class Recording(ABC):
-    """One recording. It is read from the start each time.
+    """A recording, read from the start each time.
 
     Attributes:
         path: the file or folder.
-        topics: all of them, by name.
-        damage: what the last call of `messages` lacked, or before the first one the list of topics, and where; None:
+        topics: all topics, by name.
+        damage: what the last call of `messages` lacked, or before the first call the list of topics, and where; None:
             nothing.
         notes: sentences for the user about how it is read.
     """
@@ -58,13 +58,13 @@ class Recording(ABC):
 
     @abstractmethod
     def messages(self, topic: str) -> Iterator[Message]:
-        """The messages of a topic in the order of their times; a damaged recording ends early (`damage`)."""
+        """Yield the messages of a topic by time; a damaged recording ends early (`damage`)."""
 
     def point_cloud_topic(self, wanted: str | None = None) -> Topic:
-        """The topic of that name, or the only one that holds scans.
+        """Return the topic of that name, or the only one with scans.
 
         Raises:
-            ScanError: there is none, it holds something else, or there are several; names all that are there.
+            ScanError: there is none, it holds something else, or there are several; names all available ones.
         """
         clouds = [topic for topic in self.topics if topic.is_point_cloud]
         if wanted is not None:
@@ -90,7 +90,7 @@ class Recording(ABC):
         return filled[0]
 
     def _remedy(self, topics: Sequence[Topic]) -> str:
-        """The advice where none of these topics is read."""
+        """Return the advice if none of these topics can be read."""
         for topic in topics:
             if conversion := conversion_of(topic.type):
                 return f"the scans are recorded as {topic.type}, which is not read: {conversion}"
@@ -100,12 +100,12 @@ class Recording(ABC):
 
 
 def listed(topics: Sequence[Topic]) -> str:
-    """The topics with their types and counts, in one line."""
+    """Return the topics with their types and counts, in one line."""
     return ", ".join(f"{topic.name} ({topic.type}, {topic.messages})" for topic in topics) or "none"
 
 
 def merged(topics: Iterable[Topic]) -> list[Topic]:
-    """Topics by name, those of one name as one with all their messages."""
+    """Return the topics by name, with those of one name merged and their messages added."""
     by_name: dict[str, list[Topic]] = {}
     for topic in topics:
         by_name.setdefault(topic.name, []).append(topic)
@@ -120,6 +120,6 @@ def _common_type(topics: Sequence[Topic]) -> str:
 
 
 def reason(error: Exception) -> str:
-    """An error of a library in one short line."""
+    """Return a library's error as one short line."""
     name = "" if type(error) is ValueError else type(error).__name__
     return " ".join(f"{name} {error}".split())[:100]

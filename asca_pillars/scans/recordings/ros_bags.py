@@ -1,4 +1,4 @@
-"""ROS 1 bags, by the library rosbags; a chunk or message that cannot be read costs no more than that."""
+"""ROS 1 bags, read with the library rosbags; damaged chunks and messages are skipped."""
 
 import heapq
 from collections.abc import Callable, Iterator
@@ -13,14 +13,14 @@ from asca_pillars.scans.recordings.recording import SEVERAL_TYPES, Message, Reco
 
 
 class RosBag(Recording):
-    """A ROS 1 `.bag` file.
+    """ROS 1 `.bag` file.
 
     Args:
-        path: of the recording, for messages.
-        file: where it is read; None: at `path`.
+        path: path of the recording in error messages.
+        file: file to read; None: `path`.
 
     Raises:
-        ScanError: no such recording, or it cannot be read.
+        ScanError: not such a recording, or it cannot be read.
     """
 
     def __init__(self, path: Path, file: Path | None = None) -> None:
@@ -31,7 +31,7 @@ class RosBag(Recording):
             )
 
     def messages(self, topic: str) -> Iterator[Message]:
-        """The messages of a topic by time; those that cannot be read are left out."""
+        """Yield the messages of a topic by time; those that cannot be read are left out."""
         self.damage, count, trouble = None, 0, ""
         damaged_chunks: set[int] = set()
         with self._opened() as reader:
@@ -40,7 +40,7 @@ class RosBag(Recording):
             for entry, number in heapq.merge(*entries, key=lambda pair: pair[0].time):
                 if entry.chunk_pos in damaged_chunks:
                     continue
-                # The library's generator ends with the first error: it is asked for one message at a time.
+                # The library's generator ends at the first error, so a new one is created for each message.
                 reader.indexes[number] = [entry]
                 try:
                     _, time_ns, data = next(reader.messages([connections[number]]))
@@ -48,7 +48,7 @@ class RosBag(Recording):
                     trouble = trouble or f" ({reason(error)})"
                     if reader.current_chunk[0] != entry.chunk_pos:
                         damaged_chunks.add(entry.chunk_pos)
-                        reader.current_chunk = (-1, BytesIO())  # the one before was closed
+                        reader.current_chunk = (-1, BytesIO())  # the previous one was closed
                     continue
                 count += 1
                 yield Message(time_ns, bytes(data), "ros1")
@@ -72,7 +72,7 @@ class RosBag(Recording):
 
 
 def _bounded(chunk: Any) -> Callable[[bytes], bytes]:
-    """A function that decompresses a chunk up to a limit, for the one that the library would use."""
+    """Return a function that decompresses a chunk up to a limit, in place of the library's."""
     from rosbags.rosbag1.reader import Compression, decompressors
 
     bounded: dict[str, Callable[[bytes], bytes]] = {
@@ -83,7 +83,7 @@ def _bounded(chunk: Any) -> Callable[[bytes], bytes]:
 
 
 class _Closing:
-    """`with` for a reader that is open already."""
+    """Context manager for a reader that is already open."""
 
     def __init__(self, reader: Any) -> None:
         self._reader = reader

@@ -1,4 +1,4 @@
-"""A folder of rosbag2: a recording in several files that follow each other, and its metadata.yaml."""
+"""Folders of rosbag2: a recording in several consecutive files, and its metadata.yaml."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -15,14 +15,14 @@ _KEY = "rosbag2_bagfile_information"
 
 @dataclass(frozen=True)
 class BagMetadata:
-    """The names of files and the number of messages of each topic, as far as a metadata.yaml states them."""
+    """Names of files and the number of messages of each topic, as far as a metadata.yaml states them."""
 
     files: tuple[str, ...] = ()
     counts: Mapping[str, int] = field(default_factory=dict)
 
 
 def read_metadata(folder: Path) -> BagMetadata | None:
-    """Read the folder's metadata.yaml; None if there is none, or one of something else than rosbag2."""
+    """Read the folder's metadata.yaml; return None if it is missing, or not one of rosbag2."""
     path = folder / METADATA_FILE
     if not path.is_file():
         return None
@@ -43,13 +43,13 @@ def read_metadata(folder: Path) -> BagMetadata | None:
 
 
 class SplitRecording(Recording):
-    """The files of a folder as one recording.
+    """Files of a folder as one recording.
 
     Args:
         path: the folder.
-        files: in their order.
-        counts: messages of each topic that there should be.
-        trouble: what is wrong with files that are not among these; None: nothing.
+        files: files in their order.
+        counts: stated number of messages of each topic.
+        trouble: error of files that are not among these; None: none.
     """
 
     def __init__(
@@ -61,7 +61,7 @@ class SplitRecording(Recording):
         self.damage = trouble or next((file.damage for file in files if file.damage), None)
 
     def messages(self, topic: str) -> Iterator[Message]:
-        """The messages of a topic, file after file; damage in one does not end the recording."""
+        """Yield the messages of a topic, file by file; damage in one does not end the recording."""
         self.damage, count = self._trouble, 0
         for file in self._files:
             if all(one.name != topic for one in file.topics):

@@ -1,11 +1,11 @@
-"""Types of messages that hold a sensor's scans: those that are read, and how to convert recordings of the others."""
+"""Message types with a sensor's scans: supported ones, and how to convert recordings of the others."""
 
 import re
 from typing import Literal
 
 _REPLAY = "play the recording through the sensor's driver and record the PointCloud2 that it publishes"
 _CONVERSIONS = (
-    # None: no scans of a lidar in 3D.
+    # None: no scans of a 3D LiDAR
     (r"sensor_msgs/(msg/)?(Multi\w*)?LaserScan|radar_\w*/.*", None),
     (r"foxglove_msgs/(msg/)?PointCloud", "record the PointCloud2 that it was made of"),
     (r".*(Scans?|Packets?|PacketMsg|UdpFrame|PointCloud\d?|CustomMsg)", _REPLAY),
@@ -29,5 +29,5 @@ def kind_of_scans(type_name: str) -> ScanKind | None:
 
 
 def conversion_of(type_name: str) -> str | None:
-    """Advice on making PointCloud2 of scans of a type; None if it is not known to hold scans."""
+    """Return advice on converting scans of a type to PointCloud2; None if it is not known to hold scans."""
     return next((remedy for pattern, remedy in _CONVERSIONS if re.fullmatch(pattern, type_name)), None)

@@ -1,4 +1,4 @@
-"""SQLite files of rosbag2, row by row: one that cannot be read costs its message."""
+"""SQLite files of rosbag2, read row by row; a row that cannot be read loses only its message."""
 
 from collections.abc import Iterator
 from contextlib import closing
@@ -9,22 +9,22 @@ from asca_pillars.base.errors import ScanError
 from asca_pillars.scans.recordings.recording import LAST_NS, UNKNOWN_TYPE, Message, Recording, Topic, merged, reason
 
 if TYPE_CHECKING:
-    import sqlite3  # not every Python has it
+    import sqlite3  # not included in every Python
 
 _INSTRUCTIONS = 10_000
-"""SQLite may run a hundred times 10,000 instructions, and a hundred for each byte of the file; files of the smallest
+"""Limit of SQLite's work: a hundred times 10,000 instructions, and a hundred for each byte of the file; files of the
 messages need less than one for each."""
 
 
 class SqliteRecording(Recording):
-    """One `.db3` file of any version of rosbag2.
+    """`.db3` file of any version of rosbag2.
 
     Args:
-        path: of the recording, for messages.
-        file: where it is read; None: at `path`.
+        path: path of the recording in error messages.
+        file: file to read; None: `path`.
 
     Raises:
-        ScanError: no such file, or it cannot be read.
+        ScanError: not such a file, or it cannot be read.
     """
 
     def __init__(self, path: Path, file: Path | None = None) -> None:
@@ -32,20 +32,20 @@ class SqliteRecording(Recording):
         try:
             with closing(self._connected()) as database:
                 self._read_topics(database)
-        except Exception as error:  # SQLite's own, and UnicodeDecodeError of what it says of damage
+        except Exception as error:  # SQLite's own, and UnicodeDecodeError of its messages about damage
             raise ScanError(
                 f"{path}: no readable rosbag2 ({reason(error)}); copy it again, or mend it "
                 "(sqlite3 broken.db3 .recover | sqlite3 mended.db3)"
             ) from None
 
     def messages(self, topic: str) -> Iterator[Message]:
-        """The messages of a topic by time; a row without data, or with damaged data, is a message without data."""
+        """Yield the messages of a topic by time; a row without intact data is a message without data."""
         self.damage, count = None, 0
         declared = sum(one.messages for one in self.topics if one.name == topic)
         numbers = self._numbers[topic]
         if formats := self._formats[topic] - {"cdr"}:
             raise ScanError(f"{self.path}: {topic} is encoded as {', '.join(sorted(formats))[:40]}; cdr is read")
-        # An error in one query of a connection moves the others': data are read through a connection of their own.
+        # An error in one query of a connection affects its others: data are read through a separate connection.
         with closing(self._connected()) as database, closing(self._connected()) as data:
             try:
                 rows = database.execute(
@@ -54,7 +54,7 @@ class SqliteRecording(Recording):
                     numbers,
                 )
                 for row, recorded_ns in rows:
-                    if count == declared:  # damaged pages that lead to each other have rows without end
+                    if count == declared:  # damaged pages that refer to each other give endless rows
                         raise ValueError("its index of times is damaged")
                     is_usable = isinstance(recorded_ns, int) and 0 <= recorded_ns <= LAST_NS
                     yield Message(recorded_ns if is_usable else None, self._data(data, row), "cdr")
@@ -65,7 +65,7 @@ class SqliteRecording(Recording):
     def _connected(self) -> "sqlite3.Connection":
         import sqlite3
 
-        # The stream of a detector may read in one thread what was opened in another, but never in two at once.
+        # A detector's stream may read in another thread than the opening one, but never in two at once.
         connection = sqlite3.connect(f"{self._file.resolve().as_uri()}?immutable=1", uri=True, check_same_thread=False)
         connection.text_factory = _text
         left = iter(range(100 + self._file.stat().st_size // 100))

@@ -1,4 +1,4 @@
-"""Bicycles with their riders, parked ones and motorcycles, which KITTI does not label; x ahead, wheels on z = 0."""
+"""Bicycles with and without riders, and motorcycles, which KITTI does not label; x forward, wheels on z = 0."""
 
 from dataclasses import replace
 from typing import NamedTuple
@@ -25,11 +25,11 @@ _SEGMENTS = 12  # of a wheel's circle
 _RIM = 0.70  # inner over outer radius of tire and rim together
 MUDGUARD_SHARE, RACK_SHARE, REFLECTOR_SHARE = 0.8, 0.7, 0.8
 STRIPED_TIRE_SHARE, VEST_SHARE = 0.25, 0.1  # with a ring of foil on the sidewalls; riders with foil on their jacket
-REFLECTOR = Surface(2.5, 0.5)  # sends the light back where it came from
+REFLECTOR = Surface(2.5, 0.5)  # retroreflective
 
 
 def _circle() -> Floats:
-    """Quadrilaterals (segments,4,3) from each point of the unit circle to the next and back."""
+    """Return quadrilaterals (segments,4,3) from each point of the unit circle to the next and back."""
     angle = np.linspace(0, 2 * np.pi, _SEGMENTS + 1)
     ring = np.stack([np.cos(angle), np.zeros_like(angle), np.sin(angle)], axis=1)
     a, b = ring[:-1], ring[1:]
@@ -37,7 +37,7 @@ def _circle() -> Floats:
 
 
 _CIRCLE = _circle()
-# Distances of the corners of tread, tire side and spokes from the hub, as shares of the radius, and sideways.
+# Distances of the corners of tread, tire side and spokes from the hub, as fractions of the radius, and sideways.
 _SHARE_OF_RADIUS = np.array([[1.0, 1.0, 1.0, 1.0], [1.0, 1.0, _RIM, _RIM], [_RIM, _RIM, 0.0, 0.0]])[:, None, :, None]
 _ASIDE = np.zeros((3, 1, 4, 3))
 _ASIDE[0, 0, :, 1] = 0.035, 0.035, -0.035, -0.035
@@ -60,9 +60,9 @@ def _frame(length: float) -> _Frame:
 
 
 def bicycle(rng: np.random.Generator, length: float, footprint_m: float = 0.0) -> Primitives:
-    """A bicycle: wheels, frame, handlebar, saddle; mostly mudguards, a rack, lamps and reflectors.
+    """Return a bicycle: wheels, frame, handlebar, saddle; mostly mudguards, a rack, lamps and reflectors.
 
-    They grow by `footprint_m`, the width of a laser's beam there.
+    Its parts are enlarged by `footprint_m`, the width of a laser's beam there.
     """
     frame = _frame(length)
     paint = float(np.exp(rng.uniform(np.log(0.03), np.log(0.5))))
@@ -70,7 +70,7 @@ def bicycle(rng: np.random.Generator, length: float, footprint_m: float = 0.0) -
     rows: list[tuple[float, ...]] = []
     if rng.random() < RACK_SHARE:
         rows.append((-frame.hub_x - 0.02, 0, 2 * frame.wheel_radius + 0.06, 0.42, 0.13, 0.04, 0, paint, 0.4, 0))
-    if rng.random() < MUDGUARD_SHARE:  # and a guard before the chain
+    if rng.random() < MUDGUARD_SHARE:  # and a chain guard
         rows.append((-0.5 * frame.hub_x, -0.05, 0.24, 0.9 * frame.hub_x, 0.03, 0.13, 0, paint, 0.4, 0))
         parts.append(_mudguards(frame, Surface(float(np.exp(rng.uniform(np.log(0.05), np.log(0.6)))), 0.4)))
     if rng.random() < REFLECTOR_SHARE:
@@ -96,7 +96,7 @@ def bicycle(rng: np.random.Generator, length: float, footprint_m: float = 0.0) -
 
 
 def _wheels(rng: np.random.Generator, frame: _Frame) -> Primitives:
-    """Tires with their rims, and spokes as disks that let many rays through."""
+    """Return tires with their rims, and spokes as mostly transparent disks."""
     rubber = Surface(float(np.exp(rng.uniform(np.log(0.04), np.log(0.3)))), 0.3)
     sidewall = Surface(float(rng.uniform(0.45, 0.95)), 0.3) if rng.random() < STRIPED_TIRE_SHARE else rubber
     spokes = Surface(float(rng.uniform(0.05, 0.3)), 0.2, float(rng.uniform(0.5, 0.75)))
@@ -108,11 +108,11 @@ def _wheels(rng: np.random.Generator, frame: _Frame) -> Primitives:
 
 
 def _mudguards(frame: _Frame, surface: Surface) -> Primitives:
-    """Strips above the rear halves of both wheels."""
+    """Return strips above the rear halves of both wheels."""
     angle = np.deg2rad(np.linspace(40.0, 190.0, 6))
     arc = (frame.wheel_radius + 0.02) * np.stack([np.cos(angle), np.zeros_like(angle), np.sin(angle)], axis=1)
     side = np.array([0.0, 0.045, 0.0])
-    drop = np.array([[0.95, 1.0, 0.95]])  # they bend down at their sides, where a ray from aside meets them
+    drop = np.array([[0.95, 1.0, 0.95]])  # they bend down at their sides, where rays from the side hit them
     left, right = arc + side, arc - side
     edges = ((left, right), (left, arc * drop + side), (right, arc * drop - side))
     faces = np.concatenate([np.stack([one[:-1], one[1:], other[1:], other[:-1]], 1) for one, other in edges])
@@ -121,7 +121,7 @@ def _mudguards(frame: _Frame, surface: Surface) -> Primitives:
 
 
 def _tubes(rng: np.random.Generator, frame: _Frame, paint: float) -> Primitives:
-    """Frame and handlebar."""
+    """Return frame and handlebar."""
     head, crank, post, radius = frame.head, frame.crank, frame.post, frame.wheel_radius
     rear, front = (-frame.hub_x, 0.0, radius), (frame.hub_x, 0.0, radius)
     bar = head[0] - 0.06
@@ -144,7 +144,7 @@ def _tubes(rng: np.random.Generator, frame: _Frame, paint: float) -> Primitives:
 def cyclist_body(
     rng: np.random.Generator, height: float, width: float, length: float, footprint_m: float = 0.0
 ) -> Primitives:
-    """A bicycle and its rider, upright to bent over.
+    """Return a bicycle and its rider, upright to bent over.
 
     `height` is that of the head above the ground, `footprint_m` as for `bicycle`.
     """
@@ -166,7 +166,7 @@ def cyclist_body(
 
 
 def _rider(rng: np.random.Generator, neck: Floats, width: float, bar_x: float) -> Primitives:
-    """Trunk, arms and legs between saddle, pedals and handlebar."""
+    """Return trunk, arms and legs between saddle, pedals and handlebar."""
     upper, lower, shoe = draw_cloth(rng, 3, dark_share=0.25)
     bulk = float(rng.uniform(1.2, 1.55))
     shoulder = float(np.clip(0.36 * width, 0.17, 0.26))
@@ -205,7 +205,7 @@ def _offset(joint: Floats, along: float, sideways: float, up: float) -> Floats:
 
 
 def _luggage(rng: np.random.Generator, neck: Floats, length: float) -> Primitives:
-    """A rucksack, panniers, a basket, a child behind the saddle, or nothing."""
+    """Return a rucksack, panniers, a basket, a child behind the saddle, or nothing."""
     what = rng.random()
     if what < 0.26:
         return ellipsoids([(neck[0] - 0.24, 0, neck[2] - 0.2)], [(0.13, 0.16, 0.22)], draw_cloth(rng, 1))
@@ -221,7 +221,7 @@ def _luggage(rng: np.random.Generator, neck: Floats, length: float) -> Primitive
 
 
 def parked_bicycle_body(rng: np.random.Generator) -> Primitives:
-    """A bicycle of a drawn size that leans on its stand or on a wall, sometimes with a basket or panniers."""
+    """Return a bicycle of random size on its stand or against a wall, sometimes with a basket or panniers."""
     parts = [bicycle(rng, float(rng.uniform(1.45, 1.9)))]
     if rng.random() < 0.25:
         parts.append(cuboids([(rng.choice([-0.62, 0.55]), 0, 0.75, 0.3, 0.32, 0.25, 0, 0.25, 0.3, 0.4)]))
@@ -229,12 +229,12 @@ def parked_bicycle_body(rng: np.random.Generator) -> Primitives:
 
 
 def motorbike_body(rng: np.random.Generator) -> Primitives:
-    """A motorcycle or a scooter on its stand."""
+    """Return a motorcycle or a scooter on its stand."""
     return _leaning(_motorbike(rng, float(rng.uniform(1.7, 2.2))), float(rng.uniform(-0.25, 0.25)))
 
 
 def motorcyclist_body(rng: np.random.Generator, height: float, length: float) -> Primitives:
-    """A motorcycle or a scooter and its rider, whose helmet is `height` above the ground; KITTI's Misc."""
+    """Return a motorcycle or a scooter and its rider, whose helmet is `height` above the ground; KITTI's Misc."""
     jacket, trousers = np.column_stack([rng.uniform(0.02, 0.5, 2), rng.uniform(0.05, 0.4, 2), np.zeros(2)])
     across = np.array([0.0, 0.1, 0.0])
     hips, neck = np.array([-0.25, 0.0, 0.86]), np.array([0.0, 0.0, height - 0.27])
@@ -272,7 +272,7 @@ def _motorbike(rng: np.random.Generator, length: float) -> Primitives:
 
 
 def _leaning(body: Primitives, angle_rad: float) -> Primitives:
-    """The body rolled about its x axis."""
+    """Return the body rolled about its x axis."""
     cos, sin = np.cos(angle_rad), np.sin(angle_rad)
     roll = np.array([[1.0, 0.0, 0.0], [0.0, cos, -sin], [0.0, sin, cos]])
     return replace(

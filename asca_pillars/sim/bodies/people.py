@@ -1,6 +1,6 @@
-"""People on foot and sitting, and what they carry, push and pull.
+"""Pedestrians and sitting people, and objects that they carry, push and pull.
 
-They are built of ellipsoids with jointed limbs; x ahead, feet on z = 0.
+They consist of ellipsoids with jointed limbs; x forward, feet on z = 0.
 """
 
 import numpy as np
@@ -20,7 +20,7 @@ from asca_pillars.sim.bodies.primitives import (
     quads,
 )
 
-# Shares of people with each, one after another; the others carry nothing.
+# Fractions of people with each, in order; the others carry nothing.
 SHARES = {
     "rucksack": 0.26,
     "bag": 0.18,
@@ -30,11 +30,11 @@ SHARES = {
     "bicycle": 0.04,
     "umbrella": 0.03,
 }
-_WALKER_M = 1.5  # children push nothing
+_WALKER_M = 1.5  # smaller people, children, push nothing
 
 
 def draw_burden(rng: np.random.Generator, height: float, lean_m: float, shoulder_m: float) -> Primitives:
-    """Object that a person of that height carries, pulls or pushes; often nothing."""
+    """Return an object that a person of that height carries, pulls or pushes; often nothing."""
     names = (*SHARES, "nothing")
     what = names[int(np.searchsorted(np.cumsum(list(SHARES.values())), rng.random()))]
     side = float(rng.choice([-1.0, 1.0]))
@@ -59,7 +59,7 @@ def draw_burden(rng: np.random.Generator, height: float, lean_m: float, shoulder
 
 
 def _pram(cloth: np.ndarray) -> Primitives:
-    """A tub, a hood and wheels."""
+    """Return a pram: tub, hood and wheels."""
     tub = ellipsoids(
         [(0.75, 0, 0.72), (0.58, 0, 0.88)], [(0.38, 0.22, 0.17), (0.16, 0.22, 0.17)], np.repeat(cloth, 2, axis=0)
     )
@@ -68,7 +68,7 @@ def _pram(cloth: np.ndarray) -> Primitives:
 
 
 def _umbrella(rng: np.random.Generator, height: float, lean_m: float, side: float, cloth: np.ndarray) -> Primitives:
-    """Open, over the head: a flat cap on a stick. It stands out of the label's box, as KITTI's do."""
+    """Return an open umbrella over the head, a flat cap on a stick. It exceeds the label's box, as in KITTI."""
     top, radius = height + float(rng.uniform(0.0, 0.1)), float(rng.uniform(0.35, 0.45))
     place = (lean_m + 0.05, side * 0.05, top - 0.1)
     stick = prisms([(place[0], place[1], 0.6 * height, top - 0.6 * height, 0.02, 0.02, 0.2)], sides=4)
@@ -78,19 +78,19 @@ def _umbrella(rng: np.random.Generator, height: float, lean_m: float, side: floa
 def pedestrian_body(
     rng: np.random.Generator, height: float, width: float, length: float, walked_m: float = 0.0
 ) -> Primitives:
-    """A standing or walking person. `width` bounds the shoulders and arms, `length` the step and the swing.
+    """Return a standing or walking person. `width` bounds the shoulders and arms, `length` the step and the swing.
 
-    The step goes on with `walked_m`, and nothing else of the body does: the same `rng` gives the same person.
+    Only the step depends on `walked_m`: the same `rng` gives the same person.
     """
     h = height
     shoulder = float(np.clip(0.40 * width + 0.04, 0.19, 0.30)) * min(h / 1.6, 1.0)
-    lean = float(rng.normal(0.03, 0.025)) * h  # forward, as of one who walks
+    lean = float(rng.normal(0.03, 0.025)) * h  # forward, as when walking
     upper, lower, shoe = draw_cloth(rng, 3)
     skin = draw_skin(rng)
     thick = float(rng.uniform(1.35, 1.8))
-    # A box covers all the poses of a walk: in a single scan the feet are somewhere between together and far apart.
+    # A label box covers all the poses of a walk: in a single scan the feet are between together and far apart.
     stride = float(np.clip(length / 2 - 0.07, 0.06, 0.58)) * (1.0 if rng.random() < 0.88 else 0.2)
-    # Feet rest on the ground where the step is widest: half of the walkers are near there.
+    # Feet rest on the ground where the step is widest: half of the walkers are near that phase.
     phase = float(rng.uniform(0.0, 2 * np.pi) if rng.random() < 0.5 else rng.normal(np.pi / 2, 0.5))
     phase += np.pi * walked_m / (2 * stride)  # a foot on the ground stays there while the body passes over it
     rows: list[Limb] = [
@@ -121,7 +121,7 @@ def pedestrian_body(
 
 
 def _leg(h: float, side: float, stride: float, phase: float, thick: float, cloth: tuple[Floats, Floats]) -> list[Limb]:
-    """Thigh, shin and shoe of a walker; the leg that swings forward is bent and off the ground."""
+    """Return thigh, shin and shoe of a walker; the leg that swings forward is bent and off the ground."""
     lower, shoe = cloth
     forward = stride * np.sin(phase) * side
     lift = 0.5 * min(stride, 0.3) * max(np.cos(phase) * side, 0.0)
@@ -149,7 +149,7 @@ def _arm(
     trunk: tuple[float, float],
     cloth: tuple[Floats, Floats],
 ) -> list[Limb]:
-    """Upper arm and forearm: hanging and swinging, or bent to hold, point or telephone. `trunk`: lean, shoulder."""
+    """Return upper arm and forearm: swinging, or bent to hold, point or telephone. `trunk`: lean, shoulder."""
     lean, shoulder = trunk
     upper, skin = cloth
     swing += float(rng.normal(0.0, 0.04))
@@ -167,7 +167,7 @@ def _arm(
 
 
 def sitting_body(rng: np.random.Generator, height: float) -> Primitives:
-    """A person on a chair or a bench; `height` is that of the head above the ground."""
+    """Return a person on a chair or a bench; `height` is that of the head above the ground."""
     h = height
     upper, lower = draw_cloth(rng, 2)
     seat = 0.36 * h

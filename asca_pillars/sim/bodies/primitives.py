@@ -1,4 +1,4 @@
-"""The simple shapes that a scene is made of: triangles, ellipsoids and limbs, with the surface that a laser meets."""
+"""Geometric primitives of a scene: triangles, ellipsoids and limbs, with their surfaces."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from asca_pillars.geometry.arrays import Floats
 
-BACKGROUND = -1  # owner of everything that is no labelled object
+BACKGROUND = -1  # owner of unlabelled primitives
 
 _CUBE_FACES = np.array(
     [[0, 1, 5, 4], [1, 2, 6, 5], [2, 3, 7, 6], [3, 0, 4, 7], [4, 5, 6, 7]]  # sides, top; the bottom is never seen
@@ -26,7 +26,7 @@ class Surface:
         reflectance: 0..1 at normal incidence.
         gloss: the returned reflectance falls with cos(incidence) ** gloss; 0 is matte.
         transparency: share of rays that pass through (triangles only).
-        density_per_m: of a cloud (ellipsoids only); 0 is solid.
+        density_per_m: density of a cloud (ellipsoids only); 0 is solid.
     """
 
     reflectance: float
@@ -36,7 +36,7 @@ class Surface:
 
     @property
     def row(self) -> Floats:
-        """(3,) reflectance, gloss, transparency, as triangles carry it."""
+        """(3,) reflectance, gloss, transparency, as in the surface table of triangles."""
         return np.array([self.reflectance, self.gloss, self.transparency])
 
 
@@ -52,7 +52,7 @@ class Primitives:
 
     @classmethod
     def join(cls, parts: Sequence[Self]) -> Self:
-        """All primitives of the parts, in their order."""
+        """Return all primitives of the parts, in their order."""
         if not parts:
             return cls(np.zeros((0, 3, 3)), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros((0, 3)))
         return cls(
@@ -64,7 +64,7 @@ class Primitives:
         )
 
     def placed(self, x_m: float, y_m: float, z_m: float, yaw_rad: float) -> "Primitives":
-        """The same body turned about +z and moved."""
+        """Return the body rotated about +z and translated."""
         cos, sin = np.cos(yaw_rad), np.sin(yaw_rad)
         rotation = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
         shift = np.array([x_m, y_m, z_m])
@@ -78,8 +78,8 @@ class Primitives:
 
 
 def rotated(vectors: Floats, rotation: Floats) -> Floats:
-    """Vectors (..., 3), in metres or unitless, turned by a rotation (3, 3)."""
-    # One product: NumPy would multiply a stack of matrices one after another.
+    """Rotate vectors (..., 3), in metres or unitless, by a rotation (3, 3)."""
+    # One product: NumPy would multiply a stack of matrices one by one.
     return (vectors.reshape(-1, 3) @ rotation.T).reshape(vectors.shape)
 
 
@@ -88,7 +88,7 @@ def _only_triangles(triangles: Floats, surface: Floats) -> Primitives:
 
 
 def quads(corners: ArrayLike, surface: Surface | Floats) -> Primitives:
-    """Flat quadrilaterals: corners (...,4,3) in order around each, metres.
+    """Return flat quadrilaterals: corners (...,4,3) in order around each, metres.
 
     One surface for all, or a table (...,3) of each one's reflectance, gloss, transparency.
     """
@@ -99,7 +99,7 @@ def quads(corners: ArrayLike, surface: Surface | Floats) -> Primitives:
 
 
 def cuboids(rows: ArrayLike) -> Primitives:
-    """Boxes without a bottom, 10 triangles each.
+    """Return boxes without a bottom, 10 triangles each.
 
     Rows (N,10) are x, y, bottom z, length, width, height, in metres, yaw in radians, and a surface's reflectance,
     gloss, transparency.
@@ -118,10 +118,10 @@ def cuboids(rows: ArrayLike) -> Primitives:
 
 
 def prisms(rows: ArrayLike, sides: int = 8) -> Primitives:
-    """Round posts of 2 * `sides` triangles each, open at both ends (a lid is thinner than a laser's footprint).
+    """Return round posts of 2 * `sides` triangles each, open at both ends (a lid is thinner than a laser's footprint).
 
-    Rows (N,9) are x, y, bottom z, height, radius at the foot, radius at the top, in metres, reflectance, and how far
-    the top leans along x and y per metre of height; these two may be left out (N,7).
+    Rows (N,9) are x, y, bottom z, height, radius at the foot, radius at the top, in metres, reflectance, and the
+    lean of the top along x and y per metre of height; these two may be left out (N,7).
     """
     rows = np.atleast_2d(np.asarray(rows, float))
     lean = rows[:, 7:9] if rows.shape[1] == 9 else np.zeros((len(rows), 2))
@@ -145,7 +145,7 @@ def prisms(rows: ArrayLike, sides: int = 8) -> Primitives:
 
 
 def ellipsoids(centers: ArrayLike, radii: ArrayLike, surface: Floats, axes: ArrayLike | None = None) -> Primitives:
-    """Ellipsoids: centers (E,3), radii (E,3) along the rows of `axes` (E,3,3; default: x, y, z), metres.
+    """Return ellipsoids: centers (E,3), radii (E,3) along the rows of `axes` (E,3,3; default: x, y, z), metres.
 
     Surface (E,3) is reflectance, gloss, density per metre (0 is solid).
     """
@@ -160,14 +160,14 @@ def ellipsoids(centers: ArrayLike, radii: ArrayLike, surface: Floats, axes: Arra
 def limbs(
     start: ArrayLike, end: ArrayLike, radii: ArrayLike, surface: Floats, side: tuple[float, float, float]
 ) -> Primitives:
-    """Long ellipsoids from `start` to `end` (N,3), with radii (N,2): along `side` and across it; all in metres."""
+    """Return long ellipsoids from `start` to `end` (N,3), with radii (N,2): along `side` and across it; in metres."""
     start, end = np.asarray(start, float), np.asarray(end, float)
     radii = np.asarray(radii, float)
     along = end - start
     length = _lengths(along)
     along = along / length
     sideways = np.asarray(side) - along * (along @ np.asarray(side))[:, None]
-    # A limb that points sideways itself needs another second axis.
+    # A limb that points sideways needs another second axis.
     flat = _lengths(sideways)[:, 0] < 0.2
     if flat.any():
         sideways[flat] = np.cross(along[flat], (0.0, 0.0, 1.0)) + 1e-9
@@ -182,7 +182,7 @@ def limbs(
 
 
 def _lengths(vectors: Floats) -> Floats:
-    """(N,1) of vectors (N,3)."""
+    """Return the lengths (N,1) of vectors (N,3)."""
     return np.sqrt((vectors * vectors).sum(axis=1, keepdims=True))
 
 
@@ -191,19 +191,19 @@ Limb = tuple[ArrayLike, ArrayLike, float, float, Floats]
 
 
 def draw_cloth(rng: np.random.Generator, n: int, dark_share: float = 0.1) -> Floats:
-    """(n,3) surfaces: skin and cloth are bright in the near infrared, whatever their color; some cloth is black."""
+    """Return (n,3) surfaces: skin and most cloth are bright in the near infrared, some cloth is black."""
     dark = rng.random(n) < dark_share
     value = np.where(dark, rng.uniform(0.003, 0.06, n), rng.uniform(0.12, 0.8, n))
     return np.column_stack([value, rng.uniform(0.05, 0.4, n), np.zeros(n)])
 
 
 def draw_skin(rng: np.random.Generator) -> Floats:
-    """(3,) reflectance, gloss, density of bare skin."""
+    """Return (3,) reflectance, gloss, density of bare skin."""
     return np.array([rng.uniform(0.3, 0.55), 0.2, 0.0])
 
 
 def jointed(rows: list[Limb]) -> Primitives:
-    """Limbs as ellipsoids."""
+    """Return limbs as ellipsoids."""
     starts, ends, sideways, across, surfaces = zip(*rows, strict=True)
     radii = np.column_stack([sideways, across])
     return limbs(np.array(starts), np.array(ends), radii, np.array(surfaces), (0.0, 1.0, 0.0))

@@ -1,4 +1,4 @@
-"""Random changes of shape, so that a detector learns no exact one: scale per axis, smooth warps, dark patches."""
+"""Random changes of shape, against overfitting to exact shapes: scale per axis, smooth warps, dark patches."""
 
 from dataclasses import replace
 
@@ -10,12 +10,12 @@ from asca_pillars.sim.bodies.primitives import Primitives
 
 _WAVES = 2
 _WAVELENGTH_M = 1.0, 5.0
-_FEET_M = 0.5  # below, displacements fade towards the ground, on which a body stands
+_FEET_M = 0.5  # displacements fade below it towards the ground
 _PATCH_M = 0.15, 0.45
 
 
 def scaled(body: Primitives, factors: ArrayLike) -> Primitives:
-    """The body stretched about its origin by `factors` (3,) along x, y and z."""
+    """Return the body scaled about its origin by `factors` (3,) along x, y and z."""
     by = np.asarray(factors, float)
     return replace(
         body, triangles=body.triangles * by, centers=body.centers * by, unit_from_world=body.unit_from_world / by
@@ -23,10 +23,10 @@ def scaled(body: Primitives, factors: ArrayLike) -> Primitives:
 
 
 def warped(rng: np.random.Generator, body: Primitives, most_m: float) -> Primitives:
-    """The body with every point moved by a smooth random field, at most by `most_m` along each axis.
+    """Return the body with every point displaced by a smooth random field, by at most `most_m` along each axis.
 
-    The field is a sum of a few waves that are longer than a limb and mostly longer than a person. What has a place
-    moves, what has a shape around it (an ellipsoid) keeps it.
+    The field is a sum of a few waves that are longer than a limb and mostly longer than a person. Positions
+    are displaced, ellipsoids keep their shape.
     """
     direction = rng.standard_normal((_WAVES, 3))
     length = np.exp(rng.uniform(np.log(_WAVELENGTH_M[0]), np.log(_WAVELENGTH_M[1]), _WAVES))
@@ -45,7 +45,7 @@ def warped(rng: np.random.Generator, body: Primitives, most_m: float) -> Primiti
 
 
 def darkened(rng: np.random.Generator, body: Primitives) -> Primitives:
-    """The body with a patch that returns nothing, about a random place of it: black, wet, or seen at its worst."""
+    """Return the body with a patch without returns about a random point of it: black, wet or at grazing incidence."""
     middles = np.concatenate([body.triangles.mean(axis=1), body.centers])
     if not len(middles):
         return body

@@ -1,4 +1,4 @@
-"""Body styles of cars and vans: their side views, which of them a size suggests, and paint."""
+"""Body styles of cars and vans: their side views, their choice by size, and paint."""
 
 from dataclasses import dataclass, replace
 
@@ -9,11 +9,11 @@ from asca_pillars.sim.bodies.primitives import Surface
 
 @dataclass(frozen=True)
 class Profile:
-    """Side view of a body style, as shares of length (from the nose) and of height.
+    """Side view of a body style, as fractions of length (from the nose) and of height.
 
     Attributes:
         top: (x, z) of the outline from nose to tail.
-        glass: spans of x between which the top outline is a pane (windscreen, rear window).
+        glass: spans of x between which the top outline is glass (windscreen, rear window).
         cabin: span of x that has side windows.
         belt: height of the belt line.
         tumble: half width of the roof over half width of the body.
@@ -27,12 +27,12 @@ class Profile:
 
 
 def outline(x: tuple[float, ...], z: tuple[float, ...]) -> tuple[tuple[float, float], ...]:
-    """Points from nose to tail: shares of length, shares of height."""
+    """Return points from nose to tail: fractions of length, fractions of height."""
     return tuple(zip(x, z, strict=True))
 
 
-# Roofs rise from the windscreen to about the driver's back and fall again: that slope is what rings of a sensor
-# hardly higher than the roof meet.
+# Roofs rise from the windscreen to about the driver's back and fall again: that slope is hit by rings of a sensor
+# hardly higher than the roof.
 CITY = Profile(
     outline(
         (0.0, 0.02, 0.06, 0.12, 0.23, 0.35, 0.45, 0.51, 0.58, 0.78, 0.9, 0.972, 0.99, 1.0),
@@ -131,8 +131,8 @@ BOX_VAN = Profile(
 
 
 PALE_SHARE = 0.2  # of the cars that are not dark
-BELT_LOWER = 0.035  # windows of today's streets begin lower than the profiles' outlines suggest, share of height
-# Seen from behind, short cars look like long ones: their bonnets are shorter, not their cabins.
+BELT_LOWER = 0.035  # windows of today's streets begin lower than the profiles' outlines, fraction of height
+# From behind, short cars look like long ones: their bonnets are shorter, not their cabins.
 BONNET_PER_M, USUAL_LENGTH_M = 0.055, 3.75
 
 Shares = tuple[tuple[Profile, float], ...]
@@ -145,7 +145,7 @@ _HIGH_VAN: Shares = ((VAN, 0.78), (BOX_VAN, 0.22))
 
 
 def draw_style(rng: np.random.Generator, length_m: float, height_m: float, van: bool = False) -> Profile:
-    """A body style that suits a size, with its cabin a little moved and its belt a little raised or lowered."""
+    """Return a body style that suits a size, with slightly varied cabin position and belt height."""
     if van:
         shares = _LOW_VAN if height_m < 2.05 else _HIGH_VAN
     elif height_m > 1.63:
@@ -158,7 +158,7 @@ def draw_style(rng: np.random.Generator, length_m: float, height_m: float, van: 
 
 
 def _varied(profile: Profile, bonnet: float, rng: np.random.Generator) -> Profile:
-    """A profile with its windscreen moved by `bonnet`, a share of the length, and at random."""
+    """Return a profile with its windscreen moved by `bonnet`, a fraction of the length, and at random."""
     base, tail = profile.glass[0][0], profile.cabin[1]
     if tail - base < 0.1:
         tail = 0.8
@@ -187,17 +187,17 @@ def _varied(profile: Profile, bonnet: float, rng: np.random.Generator) -> Profil
 
 @dataclass(frozen=True)
 class Paint:
-    """Lacquer on upright panels, and on hood and roof, which rays only graze: their scatter is weak but stays."""
+    """Paint of upright panels, and of hood and roof, which rays graze: their scatter is weak but not zero."""
 
     upright: Surface
     flat: Surface
 
 
 def draw_paint(rng: np.random.Generator, dark_share: float = 0.5) -> Paint:
-    """Paint, dark or pale.
+    """Return paint, dark or pale.
 
-    Dark lacquers shine where they are met head on and send hardly anything back elsewhere; pale ones with a matte
-    pigment send back a good deal from any side, others scatter hardly anything where rays only graze them.
+    Dark paint reflects at normal incidence and hardly anywhere else; pale paint with a matte
+    pigment reflects well from any side, others hardly at grazing incidence.
     """
     if rng.random() < dark_share:
         value, gloss = float(np.exp(rng.uniform(np.log(0.012), np.log(0.035)))), float(rng.uniform(0.5, 1.8))

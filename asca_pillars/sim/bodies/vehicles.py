@@ -1,6 +1,6 @@
 """Cars and vans as triangle meshes; lorries, buses, trams, trailers and caravans as boxes with wheels.
 
-x ahead, wheels on z = 0.
+x forward, wheels on z = 0.
 """
 
 from typing import NamedTuple
@@ -17,7 +17,7 @@ _SPOKES = 10
 
 
 def _unit_wheel() -> Floats:
-    """Tread (without its width), sidewall and rim of a wheel of radius 1: corners (25,4,3), the rim's two by two."""
+    """Return tread (without width), sidewall and rim of a wheel of radius 1: corners (25,4,3), the rim's in pairs."""
     angle = np.linspace(0, 2 * np.pi, _SPOKES + 1)
     ring = np.stack([np.cos(angle), np.zeros(_SPOKES + 1), np.sin(angle)], axis=1)
     a, b = ring[:-1], ring[1:]
@@ -31,7 +31,7 @@ def _unit_wheel() -> Floats:
 
 
 _WHEEL = _unit_wheel()
-_LID = ((1.0, 1.0), (0.85, 0.66), (0.45, 0.2), (0.0, 0.0))  # across hood and roof: share of half width, of the crown
+_LID = ((1.0, 1.0), (0.85, 0.66), (0.45, 0.2), (0.0, 0.0))  # across hood and roof: fraction of half width, of the crown
 
 
 class _Hull(NamedTuple):
@@ -42,11 +42,11 @@ class _Hull(NamedTuple):
     height: float
     profile: Profile
     clearance: float
-    wheel_x: Floats  # (2,) shares of length
+    wheel_x: Floats  # (2,) fractions of length
     wheel_radius: float
     crown: float
     rail: float  # height of the frame between a side window and the edge of the roof
-    nose_bow: float  # the corners of the nose stand back by this much
+    nose_bow: float  # distance by which the corners of the nose stand back
     tail_bow: float
 
 
@@ -59,9 +59,10 @@ def car_body(
     dark_share: float = 0.5,
     footprint_m: float = 0.0,
 ) -> Primitives:
-    """A lofted car or van with wheels, mirrors, plates and seats behind its glass.
+    """Return a lofted car or van with wheels, mirrors, plates and seats behind its glass.
 
-    Plates and lamps grow by `footprint_m`, the width of a laser's beam there: one that touches them returns brightly.
+    Plates and lamps are enlarged by `footprint_m`, the width of a laser's beam there: a beam that touches them returns
+    brightly.
     """
     hull = _Hull(
         length,
@@ -89,7 +90,7 @@ def car_body(
 
 
 def _sections(hull: _Hull, x: Floats) -> Floats:
-    """Left halves (S,8,3) of the cross-sections at shares `x` of the length: sill, waist, belt, lintel, ..., middle."""
+    """Return left halves (S,8,3) of the cross-sections at fractions `x` of the length: sill, waist, ..., middle."""
     top = np.array(hull.profile.top)
     z_top = np.interp(x, top[:, 0], top[:, 1]) * hull.height
     arch = hull.wheel_radius + 0.06
@@ -117,7 +118,7 @@ def _sections(hull: _Hull, x: Floats) -> Floats:
 
 
 def _bow(hull: _Hull, x: Floats, y_m: Floats) -> Floats:
-    """Distance by which a section's points at `y_m` stand ahead of its middle, metres."""
+    """Return the distance by which a section's points at `y_m` are ahead of its middle, metres."""
     outward = (y_m / (hull.width / 2)) ** 2
     return outward * (
         hull.tail_bow * np.maximum(1 - (1 - x) / 0.3, 0) - hull.nose_bow * np.maximum(1 - x / 0.45, 0) ** 1.5
@@ -125,11 +126,11 @@ def _bow(hull: _Hull, x: Floats, y_m: Floats) -> Floats:
 
 
 def _shell(hull: _Hull, paint: Paint, trim: Surface, rng: np.random.Generator) -> tuple[Floats, Floats]:
-    """The left half of a body: corners (Q,4,3) and surfaces (Q,3)."""
+    """Return the left half of a body: corners (Q,4,3) and surfaces (Q,3)."""
     profile, top = hull.profile, np.array(hull.profile.top)
-    # A pane mirrors the light that it does not let through: most windows of KITTI's cars are holes.
+    # A pane reflects specularly the light that it does not transmit: most windows of KITTI's cars are holes.
     pane = Surface(0.05, 15.0, float(rng.uniform(0.1, 0.7)))
-    # Side windows are dirty, tinted, or show a frame where the outline has none: half as many returns as from a door.
+    # Side windows are dirty or tinted, or the outline lacks a frame: half as many returns as from a door.
     window = Surface(0.05, float(np.exp(rng.uniform(np.log(0.3), np.log(12.0)))), float(rng.uniform(0.05, 0.6)))
     arch = (hull.wheel_radius + 0.06) / hull.length
     arches = (hull.wheel_x[:, None] + np.array([-1.0, -0.8, -0.4, 0.4, 0.8, 1.0]) * arch).ravel()
@@ -162,14 +163,14 @@ def _shell(hull: _Hull, paint: Paint, trim: Surface, rng: np.random.Generator) -
 
 
 def _panels(grid: Floats) -> Floats:
-    """Quadrilaterals (..., 4, 3) between the neighbors of a grid of points (R,C,3)."""
+    """Return quadrilaterals (..., 4, 3) between the neighbors of a grid of points (R,C,3)."""
     return np.stack([grid[:-1, :-1], grid[1:, :-1], grid[1:, 1:], grid[:-1, 1:]], axis=2).reshape(-1, 4, 3)
 
 
 def _end(hull: _Hull, x: float, outline: Floats) -> Floats:
-    """Left half of the nose (x = 0) or the tail (x = 1) inside its section (8,3).
+    """Return the left half of the nose (x = 0) or the tail (x = 1) inside its section (8,3).
 
-    Returns corners (4,4,3), low and high by turns.
+    Corners are (4,4,3), low and high alternating.
     """
     levels = outline[[0, 1, 4]]  # sill, waist, edge
     share = np.array([1.0, 0.6, 0.0])[:, None]
@@ -182,7 +183,7 @@ def _end(hull: _Hull, x: float, outline: Floats) -> Floats:
 
 
 def wheels(x_m: ArrayLike, half_track_m: float, radius_m: float, rng: np.random.Generator) -> Primitives:
-    """A wheel at each x on both sides: tyre tread, and a dark sidewall around a rim that shines more or less."""
+    """Return a wheel at each x on both sides: tread, dark sidewall, and a rim of random reflectance."""
     rubber = Surface(float(np.exp(rng.uniform(np.log(0.01), np.log(0.06)))), 0.3)
     rim = Surface(float(np.exp(rng.uniform(np.log(0.05), np.log(0.5)))), 0.6)
     faces = radius_m * _WHEEL
@@ -195,7 +196,7 @@ def wheels(x_m: ArrayLike, half_track_m: float, radius_m: float, rng: np.random.
 
 
 def _fittings(rng: np.random.Generator, hull: _Hull, paint: Surface, footprint_m: float) -> Primitives:
-    """Plates, lamps and their reflectors (they shine), mirrors, and the dashboard."""
+    """Return plates, lamps and their reflectors, which are bright, mirrors, and the dashboard."""
     length, width, height, profile = hull.length, hull.width, hull.height, hull.profile
     plate_z = min(0.45 * height, 0.75)
     plate = Surface(float(rng.uniform(1.5, 4.0)), 0.3).row
@@ -225,8 +226,8 @@ def _fittings(rng: np.random.Generator, hull: _Hull, paint: Surface, footprint_m
 
 
 def _seats(rng: np.random.Generator, hull: _Hull) -> Primitives:
-    """Seats, headrests, and now and then a driver and a passenger."""
-    dark = float(np.exp(rng.uniform(np.log(0.003), np.log(0.06))))  # seen through glass twice
+    """Return seats, headrests, and sometimes a driver and a passenger."""
+    dark = float(np.exp(rng.uniform(np.log(0.003), np.log(0.06))))  # visible through glass twice
     front = hull.length * (0.5 - hull.profile.cabin[0] - 0.18)
     rows = []
     for x in (front, front - 0.24 * hull.length):
@@ -241,14 +242,14 @@ def _seats(rng: np.random.Generator, hull: _Hull) -> Primitives:
             rows.append((front + 0.05, y, 0.80 * hull.height, 0.10, 0.08, 0.12, 0.12))
     table = np.array(rows)
     surface = np.column_stack([table[:, 6], np.full(len(table), 0.3), np.zeros(len(table))])
-    # Hardly a return comes from beyond the front seats, whichever end one looks in at.
+    # Hardly any return comes from beyond the front seats, from either end.
     half, top = 0.43 * hull.width, 0.72 * hull.height
     wall = [(front, half, 0.3), (front, -half, 0.3), (front, -half, top), (front, half, top)]
     return Primitives.join([ellipsoids(table[:, :3], table[:, 3:6], surface), quads([wall], Surface(0.0))])
 
 
 def truck_body(rng: np.random.Generator, length: float, width: float, height: float) -> Primitives:
-    """A lorry: cab, gap, box or flat bed on axles."""
+    """Return a lorry: cab, gap, box or flat bed on axles."""
     paint, box = draw_paint(rng, 0.35).upright, draw_paint(rng, 0.2).upright
     cab = float(rng.uniform(1.7, 2.3))
     cab_height = min(height, float(rng.uniform(2.5, 3.2)))
@@ -271,7 +272,7 @@ def truck_body(rng: np.random.Generator, length: float, width: float, height: fl
 
 
 def bus_body(rng: np.random.Generator, length: float, width: float, height: float, rail: bool = False) -> Primitives:
-    """A bus or, on rails, a tram: skirt, band of windows, roof, seats inside."""
+    """Return a bus or, on rails, a tram: skirt, band of windows, roof, seats inside."""
     paint = draw_paint(rng, 0.25).upright
     low = 0.25 if rail else 0.32
     waist, lintel = 0.42 * height, 0.80 * height
@@ -292,7 +293,7 @@ def bus_body(rng: np.random.Generator, length: float, width: float, height: floa
 
 
 def trailer_body(rng: np.random.Generator, length: float, width: float, height: float) -> Primitives:
-    """An object of KITTI's type Misc: a trailer, a caravan or a container."""
+    """Return an object of KITTI's type Misc: a trailer, a caravan or a container."""
     paint = draw_paint(rng, 0.2).upright
     foot = min(0.4, 0.3 * height)
     rows = [

@@ -21,9 +21,9 @@ from asca_pillars.sim.casting.rays import (
 )
 
 TUFT_M = 0.2
-LONE_LEAVES = 0.35  # share of the rays through a cloud that meet it by a chance of their own
+LONE_LEAVES = 0.35  # fraction of the rays through a cloud with a random number of their own
 _NEAR_AXIS_M = 0.3
-# Salts of one ray's other draws: far from those that bodies have.
+# Salts of a ray's other random numbers: far from those of bodies.
 _FACING_SALT, _TUFT_SALT = 100_000_000, 200_000_000
 
 
@@ -36,7 +36,7 @@ class Extent(NamedTuple):
 
 
 class Leaves(NamedTuple):
-    """The chance of a cloud, which its rays mostly share in tufts of so many rings and columns."""
+    """Density of a cloud, and the rings and columns of its tufts, in which rays mostly share a random number."""
 
     density_per_m: float  # 0: solid
     rings: int
@@ -45,7 +45,7 @@ class Leaves(NamedTuple):
 
 @cached(**PLAIN)
 def extent_of(m: Floats, ux: float, uy: float) -> Extent:
-    """The extent of |m p| = 1 seen along (ux, uy), from the rows of the inverse of m (3,3)."""
+    """Return the extent of |m p| = 1 seen along (ux, uy), from the rows of the inverse of m (3,3)."""
     a0 = m[1, 1] * m[2, 2] - m[1, 2] * m[2, 1]
     a1 = m[0, 2] * m[2, 1] - m[0, 1] * m[2, 2]
     a2 = m[0, 1] * m[1, 2] - m[0, 2] * m[1, 1]
@@ -63,9 +63,9 @@ def extent_of(m: Floats, ux: float, uy: float) -> Extent:
 
 @cached(**PLAIN)
 def ellipsoid_window(center: Floats, m: Floats, distance: float, limits: RayLimits) -> Window:
-    """The window of an ellipsoid |m p| = 1, m (3,3), around a center (3,) that is `distance` metres away.
+    """Return the window of an ellipsoid |m p| = 1, m (3,3), around a center (3,) at `distance` metres.
 
-    It is empty for one beside the wedge of columns that are cast.
+    It is empty if the ellipsoid is outside the wedge of columns that are cast.
     """
     cx, cy, cz = center[0], center[1], center[2]
     ux, uy = cx / max(distance, 1e-9), cy / max(distance, 1e-9)
@@ -88,7 +88,7 @@ def ellipsoid_window(center: Floats, m: Floats, distance: float, limits: RayLimi
 
 @cached(**PLAIN)
 def leaves_of(density_per_m: float, distance: float, slope: Floats, columns_per_turn: int) -> Leaves:
-    """Leaves grow in tufts, so that crowns have depth and not only noise.
+    """Return the leaves of a cloud, which grow in tufts, so that crowns have depth and not only noise.
 
     The cloud is `distance` metres away; slope (K,) is as in `Rays`.
     """
@@ -100,7 +100,7 @@ def leaves_of(density_per_m: float, distance: float, slope: Floats, columns_per_
 
 @cached(inline="always", **PLAIN)
 def leaf_chance(leaves: Leaves, k: int, j: int, salt: int, key: int) -> float:
-    """Random number that decides how far a ray gets into a cloud: its own, or that of its tuft."""
+    """Return the random number for the depth that a ray reaches in a cloud: its own, or that of its tuft."""
     chance = ray_chance(key, k, j, salt)
     if chance < LONE_LEAVES:
         return chance / LONE_LEAVES
@@ -109,7 +109,7 @@ def leaf_chance(leaves: Leaves, k: int, j: int, salt: int, key: int) -> float:
 
 @cached(inline="always", **PLAIN)
 def solid_cosine(m: Floats, x: float, y: float, z: float, dx: float, dy: float, dz: float, stretch: float) -> float:
-    """Cosine of the incidence of a ray (dx, dy, dz) at a place (x, y, z) of the unit frame, of |m p| = 1, m (3,3)."""
+    """Return the cosine of incidence of a ray (dx, dy, dz) at (x, y, z) of the unit frame, of |m p| = 1, m (3,3)."""
     nx = m[0, 0] * x + m[1, 0] * y + m[2, 0] * z
     ny = m[0, 1] * x + m[1, 1] * y + m[2, 1] * z
     nz = m[0, 2] * x + m[1, 2] * y + m[2, 2] * z
@@ -128,11 +128,11 @@ def cast_ellipsoids(
     nearest: NearestHits,
     key: int,
 ) -> None:
-    """Keep the nearest hit of E ellipsoids; count what each object alone would stop.
+    """Keep the nearest hit of E ellipsoids; count the rays that each object alone would stop.
 
     Centers (E,3), unit_from_world (E,3,3) and surface (E,3) are as in `Primitives`: metres, LiDAR frame.
     """
-    # Taken out of their tuples once: numba counts references at every access.
+    # Unpacked from their tuples once: numba counts references at every access.
     slopes, stretch, origins, phase_counts = rays.slope, rays.stretch, rays.origin_z_m, rays.phase_counts
     cos_phase, sin_phase, cos_azimuth, sin_azimuth = rays.cos_phase, rays.sin_phase, rays.cos_azimuth, rays.sin_azimuth
     first_column, number, counted = rays.first_column, rays.number, rays.counted
@@ -182,7 +182,7 @@ def cast_ellipsoids(
                     alone[who] += 1
                 if reach >= rho[k, j]:
                     continue
-                if cloud:  # leaves face anywhere
+                if cloud:  # leaves have any orientation
                     cosine = 0.35 + 0.65 * ray_chance(key, k, number[j], salt + _FACING_SALT)
                 else:
                     x, y, z = p0 + reach * q0, p1 + reach * q1, p2 + reach * q2

@@ -1,4 +1,4 @@
-"""Rays against the ground, each of which walks down to it; its height and material (compiled by numba; see `rays`)."""
+"""Rays against the ground, marched down to it; its height and material (compiled by numba; see `rays`)."""
 
 from typing import NamedTuple
 
@@ -9,8 +9,8 @@ from asca_pillars.base.compiling import cached
 from asca_pillars.geometry.arrays import Floats, Mask
 from asca_pillars.sim.casting.rays import PLAIN, NearestHits, Rays, ray_chance
 
-GROUND = -2  # owner of what the ground returns
-BANK_RUN_M = 6.0  # a bank rises over this way and is level beyond
+GROUND = -2  # owner of ground returns
+BANK_RUN_M = 6.0  # a bank rises over this distance and is level beyond
 DITCH_HALF_M = 1.0
 TRACK_SPACING_HALF_M, GAUGE_HALF_M, RAIL_HALF_M = 1.7, 0.75, 0.06
 RELIEF_STEP_M = 4.0
@@ -37,7 +37,7 @@ class Street(NamedTuple):
     lane_m: float
     bank_left: float
     bank_right: float
-    rails_v_m: float  # NO_RAILS where there are none
+    rails_v_m: float  # NO_RAILS without rails
     median_half_m: float
     rough_m: float
     camber: float
@@ -48,18 +48,18 @@ class Street(NamedTuple):
     second_v_m: float
     second_half_m: float
     ditch_m: float
-    along_m: float  # how far along x the car has driven since the scene was drawn; hills and markings stay behind
-    # Derived, because heights are asked for by the million.
+    along_m: float  # distance driven along x since the scene was drawn; hills and markings do not move
+    # Derived values, cached because heights are computed by the million.
     cos_yaw: float
     sin_yaw: float
     cos_tilt: float
     sin_tilt: float
-    rise_m: float  # how far all that may stand above the hills
+    rise_m: float  # largest height of all parts above the hills
 
 
 @cached(**PLAIN)
 def heights(points: Floats, street: Street, relief: Floats, z_m: float) -> Floats:
-    """`ground_height` of many points (N,2)."""
+    """Return `ground_height` of many points (N,2)."""
     result = np.empty(len(points))
     for i in range(len(points)):
         result[i] = ground_height(points[i, 0], points[i, 1], street, relief, z_m)
@@ -68,9 +68,9 @@ def heights(points: Floats, street: Street, relief: Floats, z_m: float) -> Float
 
 @cached(inline="always", **PLAIN)
 def road_distances(x: float, y: float, street: Street) -> tuple[float, float, float, float, float]:
-    """Road coordinates u, v, then how far outside the main road, the crossing road and both (negative inside), metres.
+    """Return road coordinates u, v, then the distances outside the main road, the crossing road and both, metres.
 
-    The main road is either carriageway.
+    Distances are negative inside. The main road is either carriageway.
     """
     cos, sin = street.cos_yaw, street.sin_yaw
     u = x * cos + y * sin
@@ -86,7 +86,7 @@ def road_distances(x: float, y: float, street: Street) -> tuple[float, float, fl
 
 @cached(**PLAIN)
 def outside_roads(points: Floats, street: Street) -> Floats:
-    """Distance of each of (N,2) points to the outside of all roads (negative inside), metres."""
+    """Return the distance of each of (N,2) points to the outside of all roads (negative inside), metres."""
     result = np.empty(len(points))
     for i in range(len(points)):
         _, _, _, _, result[i] = road_distances(points[i, 0], points[i, 1], street)
@@ -95,7 +95,7 @@ def outside_roads(points: Floats, street: Street) -> Floats:
 
 @cached(inline="always", **PLAIN)
 def on_rail(from_middle: float, tracks: float) -> bool:
-    """Whether a place that far from the middle of one track or of two lies on a rail."""
+    """Return whether a position at that distance from the middle of one track or of two is on a rail."""
     if tracks > 1.0:
         from_middle = abs(from_middle - TRACK_SPACING_HALF_M)
     return abs(from_middle - GAUGE_HALF_M) < RAIL_HALF_M
@@ -103,7 +103,7 @@ def on_rail(from_middle: float, tracks: float) -> bool:
 
 @cached(inline="always", **PLAIN)
 def ground_height(x: float, y: float, street: Street, relief: Floats, z_m: float) -> float:
-    """Height of the ground at (x, y): hills, then kerb, camber, banks and median on top of them.
+    """Return the height of the ground at (x, y): hills, with kerb, camber, banks and median added.
 
     All in metres, LiDAR frame; relief (R, R) holds heights above z_m, as in `Ground`.
     """
@@ -123,7 +123,7 @@ def ground_height(x: float, y: float, street: Street, relief: Floats, z_m: float
         height += street.kerb_m * min(outside / 0.05, 1.0)
         beyond = outside - street.pavement_m
         if beyond > 0.0 and cross > 2.0:
-            away = min((cross - 2.0) / 6.0, 1.0)  # banks and ditches end at a crossing, not as a cliff
+            away = min((cross - 2.0) / 6.0, 1.0)  # banks and ditches end at a crossing gradually
             if street.ditch_m > 0.0:
                 height -= away * street.ditch_m * max(1.0 - abs(beyond / DITCH_HALF_M - 1.0), 0.0)
                 beyond = max(beyond - 2.0 * DITCH_HALF_M, 0.0)
@@ -139,7 +139,7 @@ def ground_height(x: float, y: float, street: Street, relief: Floats, z_m: float
 
 @cached(inline="always", **PLAIN)
 def ground_material(x: float, y: float, street: Street) -> int:
-    """Material of the ground at (x, y)."""
+    """Return the material of the ground at (x, y)."""
     u, v, main, cross, outside = road_distances(x, y, street)
     if street.rails_v_m > NO_RAILS:
         from_middle = abs(v - street.rails_v_m)
@@ -164,7 +164,7 @@ def ground_material(x: float, y: float, street: Street) -> int:
 
 @cached(**PLAIN)
 def highest_within(relief: Floats, along_m: float) -> Floats:
-    """Highest (R - 1,) of relief (R, R), metres, within each multiple of RELIEF_STEP_M of the car.
+    """Return the highest (R - 1,) of relief (R, R), metres, within each multiple of RELIEF_STEP_M of the car.
 
     Rays may start below it.
     """
@@ -181,18 +181,18 @@ def highest_within(relief: Floats, along_m: float) -> Floats:
     return highest
 
 
-GROUP_DEG = 1.2  # less than what is cast beyond the image's edges
-CLEAR_M = 0.5  # a ray so high above the ground has neighbors above it, too
-LOW_M = 0.45  # less high it looks where its neighbor met the ground
-MET_M, SAME_M = 0.001, 0.0003  # a ray so near to the ground, or so little below it, has met it
+GROUP_DEG = 1.2  # less than the margin of casting beyond the image's edges
+CLEAR_M = 0.5  # neighbors of a ray so high above the ground are above it, too
+LOW_M = 0.45  # below this height, the ray is tested where its neighbor hit the ground
+MET_M, SAME_M = 0.001, 0.0003  # a ray so near to the ground, or so little below it, hits it
 START_M, REACH_M = 1.5, 85.0
 GRASS_SALT = 900_000_000
 
 
 class Descent(NamedTuple):
-    """A ray over the ground, and where it was on its way down.
+    """Ray over the ground, and its last positions on the way down.
 
-    It was above at `near_m`, and at `reach_m` below (or beyond its limit); `clear_m` is the last place at which it,
+    It was above at `near_m`, and at `reach_m` below (or beyond its limit); `clear_m` is the last position at which it,
     and all before, was CLEAR_M above the ground.
     """
 
@@ -204,7 +204,7 @@ class Descent(NamedTuple):
 
 
 class GroundRay(NamedTuple):
-    """A ray from (0, 0, up) that falls by -slope per metre towards (dx, dy)."""
+    """Ray from (0, 0, up) that falls by -slope per metre towards (dx, dy)."""
 
     up: float
     slope: float
@@ -214,19 +214,19 @@ class GroundRay(NamedTuple):
 
 @cached(inline="always", **PLAIN)
 def gap_at(ray: GroundRay, reach: float, street: Street, relief: Floats, z_m: float) -> float:
-    """Height in metres of a ray above the ground, relief (R, R), at a horizontal distance."""
+    """Return the height in metres of a ray above the ground, relief (R, R), at a horizontal distance."""
     return ray.up + ray.slope * reach - ground_height(reach * ray.dx, reach * ray.dy, street, relief, z_m)
 
 
 @cached(**PLAIN)
 def first_distance(up: float, slope: float, highest: Floats, rise: float, z_m: float) -> float:
-    """Distance in metres over which a ray of this height and slope stays above everything, in whatever direction.
+    """Return the distance in metres over which a ray of this height and slope is above everything in any direction.
 
     `highest` (rings,) is the highest relief in each ring of cells around the car.
     """
     start, ring = START_M, 0
     while ring + 1 < len(highest) and up + slope * start > z_m + highest[ring] + rise:
-        # Up to the far edge of this ring of cells the ray stays above everything.
+        # Up to the far edge of this ring of cells the ray is above everything.
         meet = (z_m + highest[ring] + rise - up) / slope if slope < 0.0 else 1e9
         start = max(start, min(meet, (ring + 1) * RELIEF_STEP_M))
         if meet <= (ring + 1) * RELIEF_STEP_M:
@@ -246,10 +246,10 @@ def descend(
     relief: Floats,
     z_m: float,
 ) -> Descent:
-    """Walk down a ray until it is below the ground, relief (R, R), or beyond `limit`, metres.
+    """March down a ray until it is below the ground, relief (R, R), or beyond `limit`, metres.
 
-    A neighboring ray was high above everything up to `clear`, and met the ground at `expected` (0: nowhere): this one
-    begins there, and looks there first once it is low.
+    A neighboring ray was high above everything up to `clear`, and hit the ground at `expected` (0: nowhere): this one
+    begins there, and is tested there first once it is low.
     """
     near, reach, above = clear, clear, 0.0
     gap = gap_at(ray, reach, street, relief, z_m)
@@ -267,7 +267,7 @@ def descend(
             reach, expected = min(expected, limit), 0.0
         else:
             # Ground steeper than this is a kerb or a bank, which is wider than the step that passes its foot.
-            # On flat ground half of the way down is quicker; kerbs are lower than what is left above them then.
+            # On flat ground half of the way down is quicker; kerbs are then lower than the remaining height.
             step = max(gap / (0.22 + descending), 0.04 + 0.006 * near)
             if descending > 0.0:
                 step = max(step, min(0.5 * gap / descending, 3.0))
@@ -278,9 +278,9 @@ def descend(
 
 @cached(inline="always", **PLAIN)
 def meeting(ray: GroundRay, way: Descent, street: Street, relief: Floats, z_m: float) -> tuple[float, float]:
-    """Distance at which a ray meets the ground, relief (R, R), between above it and below, and the gap left, metres.
+    """Return the distance, between above and below, of a ray's hit on the ground, relief (R, R), and the gap, metres.
 
-    False position, halving the weight of an end that stays.
+    Regula falsi, halving the weight of an end that stays (Illinois method).
     """
     near, above, reach, gap = way.near_m, way.above_m, way.reach_m, way.gap_m
     left = gap
@@ -300,7 +300,7 @@ def meeting(ray: GroundRay, way: Descent, street: Street, relief: Floats, z_m: f
 
 @cached(inline="always", **PLAIN)
 def facing_of(ray: GroundRay, reach: float, height: float, street: Street, relief: Floats, z_m: float) -> float:
-    """Cosine of the angle at which a ray meets the ground, relief (R, R), of this height in metres there."""
+    """Return the cosine of incidence of a ray on the ground, relief (R, R), of this height in metres there."""
     x, y, step = reach * ray.dx, reach * ray.dy, 0.05
     gx = (ground_height(x + step, y, street, relief, z_m) - height) / step
     gy = (ground_height(x, y + step, street, relief, z_m) - height) / step
@@ -311,9 +311,9 @@ def facing_of(ray: GroundRay, reach: float, height: float, street: Street, relie
 
 @cached(**PLAIN)
 def are_needed(outside: Mask, owner: NDArray[np.int32], k: int, first: int, last: int) -> bool:
-    """Whether it matters what ground columns [first, last) of ring k meet.
+    """Return whether the ground hits of columns [first, last) of ring k are needed.
 
-    It does for an object, which the ground may hide, and beside a ray that is asked for, which may lean over an edge;
+    They are for an object, which the ground may occlude, and next to a requested ray, which may straddle an edge;
     outside (K, C) is a mask as in `Rays`, owner (K, C) an index as in `NearestHits`.
     """
     rings, columns = outside.shape
@@ -335,7 +335,7 @@ def cast_ground(
 
     Street, relief (R, R), materials (6,), which are reflectances, and z_m in metres are as in `Ground`.
     """
-    # Taken out of their tuples once: numba counts references at every access.
+    # Unpacked from their tuples once: numba counts references at every access.
     slopes, origins, cos_phase, sin_phase = rays.slope, rays.origin_z_m, rays.cos_phase, rays.sin_phase
     cos_azimuth, sin_azimuth, number = rays.cos_azimuth, rays.sin_azimuth, rays.number
     rho, cosine, reflectance, owner = nearest.rho_m, nearest.cosine, nearest.reflectance, nearest.owner
@@ -346,7 +346,7 @@ def cast_ground(
     for k in range(len(slopes)):
         up, slope, cos, sin = origins[k], slopes[k], cos_phase[k], sin_phase[k]
         start = first_distance(up, slope, highest, street.rise_m, z_m)
-        # A neighbor's hit holds for this ray, too. Neighbors come in small groups, so that a ray does not depend on
+        # A neighbor's hit holds for this ray, too. Neighbors are in small groups, so that a ray does not depend on
         # whether those far from it are cast.
         clear, expected = start, 0.0
         last, needed = 0, False
@@ -373,7 +373,7 @@ def cast_ground(
             facing = facing_of(ray, reach, up + slope * reach - left, street, relief, z_m)
             material = ground_material(reach * ray.dx, reach * ray.dy, street)
             if material == VERGE:
-                # Blades of grass end the ray before the soil does, and stand up to it.
+                # Grass ends the ray before the soil, and stands upright to it.
                 reach -= rough * ray_chance(key, k, number[j], GRASS_SALT) ** 2 / max(0.12, abs(slope))
                 facing = max(facing, 0.08)
                 if reach < START_M:

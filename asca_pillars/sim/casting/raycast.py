@@ -1,9 +1,9 @@
-"""Casting a whole revolution at a whole scene: a spherical z-buffer over (ring, column).
+"""Casting of a whole revolution at a whole scene: a spherical z-buffer over (ring, column).
 
-Each triangle or ellipsoid touches only the firings of its angular window; nothing is built beforehand, because
-every scene is used once. The ground is not meshed: each ray walks down to it along its analytic height.
-All chance (glass, foliage) belongs to a firing and a primitive, so that casting fewer columns never changes what
-the others return.
+Each triangle or ellipsoid is tested against the firings of its angular window only; there is no acceleration structure,
+because every scene is used once. The ground is not meshed: each ray is marched down to its analytic height.
+Random numbers (glass, foliage) belong to a firing and a primitive, so that casting fewer columns never changes
+the other returns.
 """
 
 from typing import NamedTuple
@@ -26,7 +26,7 @@ __all__ = ["NOTHING", "Bodies", "Hits", "cast"]
 class Hits(NamedTuple):
     """First hit of each firing (K rings, C columns)."""
 
-    rho_m: Floats  # (K,C) horizontal distance from the sensor's axis; inf for nothing
+    rho_m: Floats  # (K,C) horizontal distance from the sensor's axis; inf without a hit
     cosine: Singles  # (K,C) of the angle of incidence
     reflectance: Singles  # (K,C) of the material at this incidence
     owner: NDArray[np.int32]  # (K,C) object index, BACKGROUND, GROUND or NOTHING
@@ -35,10 +35,10 @@ class Hits(NamedTuple):
 
 
 class Bodies(NamedTuple):
-    """Geometry to cast at: primitives, each with its owner and a salt.
+    """Geometry of a scene: primitives, each with its owner and a salt.
 
-    The owner is an object's index or BACKGROUND; objects are in one run each. The salt is the number that tells a
-    primitive's chance (glass, foliage) from that of the others.
+    The owner is an object's index or BACKGROUND; each object's primitives are consecutive. The salt makes a
+    primitive's random numbers (glass, foliage) differ from those of the others.
     """
 
     primitives: Primitives

@@ -1,6 +1,6 @@
-"""Parts that the compiled casters share: the rays of a scan, those that can meet a body, and the nearest hit of each.
+"""Common parts of the compiled casters: rays of a scan, windows of rays that can hit a body, and nearest hits.
 
-numba reads named tuples by name. Compiled code is cached per file, and numba does not notice a change of another file:
+numba reads named tuples by name. Compiled code is cached per file, and numba does not detect a change of another file:
 delete the __pycache__ folders after a change here.
 """
 
@@ -13,22 +13,22 @@ from asca_pillars.base.compiling import cached
 from asca_pillars.geometry.arrays import Floats, Ints, Mask, Singles
 from asca_pillars.sim.sensor.lidar import Firings
 
-NOTHING = -3  # owner of a firing that met nothing
-_BEYOND_RAD = 0.02  # columns are cast a little beyond the wedge: ring phases turn them by up to one firing
+NOTHING = -3  # owner of a firing without a hit
+_BEYOND_RAD = 0.02  # columns are cast slightly beyond the wedge: ring phases turn them by up to one firing
 
 
 class RayLimits(NamedTuple):
-    """Bounds that tell which rays can meet a body. Small: numba copies whole tuples from function to function."""
+    """Bounds for the selection of rays that can hit a body. Small: numba copies whole tuples between functions."""
 
     slope: Floats  # (K,) tan(elevation), falling
     lowest_origin_m: float
     highest_origin_m: float
     counts: int  # of the encoder, per revolution
-    wedge_slope: float  # what is cast lies within |y| <= wedge_slope * x; 0 for all around
+    wedge_slope: float  # cast directions are within |y| <= wedge_slope * x; 0 for all around
 
 
 class Rays(NamedTuple):
-    """The firings of K rings and C columns; ray (k, c) leaves (0, 0, origin_z_m[k]) towards column azimuth + phase."""
+    """Firings of K rings and C columns; ray (k, c) leaves (0, 0, origin_z_m[k]) towards column azimuth + phase."""
 
     slope: Floats  # (K,) tan(elevation), falling
     stretch: Floats  # (K,) length of a ray per metre of horizontal distance
@@ -41,7 +41,7 @@ class Rays(NamedTuple):
     first_column: Ints  # (counts + 1,) first column at or after an encoder count
     number: Ints  # (C,) of each column within the whole revolution
     columns_per_turn: int
-    outside: Mask  # (K,C) rays of which it is asked only whether they meet an object
+    outside: Mask  # (K,C) rays cast only for whether they hit an object
     counted: Mask  # (C,) columns that count for `NearestHits.alone`
     limits: RayLimits
 
@@ -49,16 +49,16 @@ class Rays(NamedTuple):
 class NearestHits(NamedTuple):
     """Nearest hit of each ray so far, (K,C), written by the casters."""
 
-    rho_m: Floats  # horizontal distance; inf for nothing
+    rho_m: Floats  # horizontal distance; inf without a hit
     cosine: Singles  # of the angle of incidence
     reflectance: Singles
     owner: NDArray[np.int32]
     stamp: NDArray[np.int32]  # the object for which the ray was last counted in `alone`
-    alone: Ints  # (objects,) counted rays that an object would stop if it stood alone
+    alone: Ints  # (objects,) counted rays that would hit an object if it stood alone
 
 
 def rays_of(firings: Firings) -> Rays:
-    """The rays of a scan's firings."""
+    """Return the rays of a scan's firings."""
     counts = len(firings.first_column) - 1
     cast_rad = np.abs(np.arctan2(np.sin(firings.azimuth_rad), np.cos(firings.azimuth_rad)))
     half_rad = float(cast_rad.max(initial=0.0)) + _BEYOND_RAD
@@ -87,7 +87,7 @@ def rays_of(firings: Firings) -> Rays:
 
 
 def no_hits(firings: Firings, objects: int) -> NearestHits:
-    """Buffers for a scan that has met nothing yet."""
+    """Return empty buffers for the hits of a scan."""
     shape = (len(firings.slope), len(firings.azimuth_rad))
     return NearestHits(
         rho_m=np.full(shape, np.inf),
@@ -99,12 +99,12 @@ def no_hits(firings: Firings, objects: int) -> NearestHits:
     )
 
 
-PLAIN = {"error_model": "numpy"}  # NumPy's division, which does not look out for zeros
+PLAIN = {"error_model": "numpy"}  # NumPy's division, without checks for zeros
 TURN = 2 * np.pi - 1e-9
 
 
 class Window(NamedTuple):
-    """Rings [first_ring, last_ring) and azimuths [low_counts, low_counts + width_counts] that can meet a body.
+    """Rings [first_ring, last_ring) and azimuths [low_counts, low_counts + width_counts] that can hit a body.
 
     Azimuths are in counts of the encoder, low_counts within one revolution from 0.
     """
@@ -117,7 +117,7 @@ class Window(NamedTuple):
 
 @cached(inline="always", **PLAIN)
 def ray_bits(key: int, ring: int, column: int, salt: int) -> np.uint64:
-    """64 random bits from a key, a ray and a salt (the finalizer of splitmix64)."""
+    """Return 64 random bits from a key, a ray and a salt (the finalizer of splitmix64)."""
     number = (np.uint64(salt) << np.uint64(24)) ^ np.uint64(ring * 4096 + column)
     z = np.uint64(key) + number * np.uint64(0x9E3779B97F4A7C15)
     z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
@@ -127,13 +127,13 @@ def ray_bits(key: int, ring: int, column: int, salt: int) -> np.uint64:
 
 @cached(inline="always", **PLAIN)
 def ray_chance(key: int, ring: int, column: int, salt: int) -> float:
-    """A uniform number in (0, 1) of a ray and a salt."""
+    """Return a uniform random number in (0, 1) of a ray and a salt."""
     return (float(ray_bits(key, ring, column, salt) >> np.uint64(11)) + 0.5) * (1.0 / 9007199254740992.0)
 
 
 @cached(**PLAIN)
 def ring_below(slope: Floats, limit: float) -> int:
-    """The index of the first ring whose slope is not above `limit`; slopes (K,) fall."""
+    """Return the index of the first ring whose slope is not above `limit`; slopes (K,) descend."""
     first, last = 0, len(slope)
     while first < last:
         middle = (first + last) // 2
@@ -146,7 +146,7 @@ def ring_below(slope: Floats, limit: float) -> int:
 
 @cached(**PLAIN)
 def rings_of(z_low: float, z_high: float, near: float, far: float, limits: RayLimits) -> tuple[int, int]:
-    """The rings [first, last) that can meet what lies between two heights and two horizontal distances."""
+    """Return the rings [first, last) that can hit between two heights and two horizontal distances."""
     above = z_high - limits.lowest_origin_m
     below = z_low - limits.highest_origin_m
     near = max(near, 1e-6)
@@ -158,7 +158,7 @@ def rings_of(z_low: float, z_high: float, near: float, far: float, limits: RayLi
 
 @cached(**PLAIN)
 def window_of(first_ring: int, last_ring: int, low: float, width: float, limits: RayLimits) -> Window:
-    """The window of these rings and of azimuths [low, low + width]."""
+    """Return the window of these rings and of azimuths [low, low + width]."""
     counts = limits.counts
     per_rad = counts / (2.0 * np.pi)
     low_counts = low * per_rad
@@ -168,7 +168,7 @@ def window_of(first_ring: int, last_ring: int, low: float, width: float, limits:
 
 @cached(inline="always", **PLAIN)
 def columns_of(window: Window, phase_counts: float, first_column: Ints, columns: int) -> tuple[int, int]:
-    """Indices [first, last) of a ring's columns that lie in a window; `last` may exceed the number of columns.
+    """Return the indices [first, last) of a ring's columns in a window; `last` may exceed the number of columns.
 
     `first_column` (counts + 1,) is as in `Rays`.
     """
@@ -188,7 +188,7 @@ def columns_of(window: Window, phase_counts: float, first_column: Ints, columns:
 def keep(
     nearest: NearestHits, k: int, j: int, reach: float, who: int, incidence: float, normal: float, gloss: float
 ) -> None:
-    """Note a hit that is nearer than what ray (k, j) has met so far.
+    """Store a hit that is nearer than the previous ones of ray (k, j).
 
     The surface has reflectance `normal` at normal incidence.
     """

@@ -1,4 +1,4 @@
-"""Rays against triangles (compiled by numba). Each has a window of rings and columns in which every ray is tried."""
+"""Rays against triangles (compiled by numba): every ray in the window of rings and columns of each is tested."""
 
 from typing import NamedTuple
 
@@ -32,7 +32,7 @@ class Edge(NamedTuple):
 
 
 class Plane(NamedTuple):
-    """Points p with normal (x, y, z) * p = away."""
+    """Plane of points p with normal (x, y, z) * p = away."""
 
     x: float
     y: float
@@ -42,13 +42,13 @@ class Plane(NamedTuple):
 
 @cached(inline="always", **PLAIN)
 def edge_of(ax: float, ay: float, az: float, bx: float, by: float, bz: float) -> Edge:
-    """The edge from a to b; exactly the opposite of that from b to a, so that neighbors leave no gap."""
+    """Return the edge from a to b; exactly the negative of that from b to a, so that neighbors leave no gap."""
     return Edge(ay * bz - az * by, az * bx - ax * bz, by - ay, ax - bx, ax * by - ay * bx)
 
 
 @cached(**PLAIN)
 def nearest_on_edge(ax: float, ay: float, bx: float, by: float) -> float:
-    """Square of the horizontal distance from the sensor's axis to the segment a b."""
+    """Return the square of the horizontal distance from the sensor's axis to the segment a b."""
     dx, dy = bx - ax, by - ay
     length = dx * dx + dy * dy
     share = 0.0
@@ -60,13 +60,13 @@ def nearest_on_edge(ax: float, ay: float, bx: float, by: float) -> float:
 
 @cached(inline="always", **PLAIN)
 def wrap(angle: float) -> float:
-    """The same angle in [-pi, pi), radians."""
+    """Return the angle in [-pi, pi), radians."""
     return angle - 2 * np.pi * np.floor((angle + np.pi) / (2 * np.pi))
 
 
 @cached(**PLAIN)
 def triangle_window(corner: Floats, limits: RayLimits) -> Window:
-    """The window of a triangle (3,3), metres; empty for one beside the wedge of columns that are cast."""
+    """Return the window of a triangle (3,3), metres; empty outside the wedge of columns that are cast."""
     ax, ay, bx, by, cx, cy = corner[0, 0], corner[0, 1], corner[1, 0], corner[1, 1], corner[2, 0], corner[2, 1]
     if limits.wedge_slope > 0.0:
         wedge = limits.wedge_slope
@@ -81,7 +81,7 @@ def triangle_window(corner: Floats, limits: RayLimits) -> Window:
     far = np.sqrt(max(ax * ax + ay * ay, bx * bx + by * by, cx * cx + cy * cy))
     z_low, z_high = min(corner[0, 2], corner[1, 2], corner[2, 2]), max(corner[0, 2], corner[1, 2], corner[2, 2])
     first, last = rings_of(z_low, z_high, near, far, limits)
-    if first >= last:  # most of them: there is no need to ask for azimuths
+    if first >= last:  # for most of them: azimuths are not needed
         return Window(0, 0, 0.0, 0.0)
     if encloses_axis:
         return window_of(first, last, -np.pi, TURN, limits)
@@ -94,7 +94,7 @@ def triangle_window(corner: Floats, limits: RayLimits) -> Window:
 
 @cached(**PLAIN)
 def plane_of(corner: Floats) -> Plane:
-    """The plane of a triangle (3,3), metres, its normal of length 1; all 0 for a triangle without an area."""
+    """Return the plane of a triangle (3,3), metres, with unit normal; all 0 for a triangle without an area."""
     ux, uy, uz = corner[1, 0] - corner[0, 0], corner[1, 1] - corner[0, 1], corner[1, 2] - corner[0, 2]
     vx, vy, vz = corner[2, 0] - corner[0, 0], corner[2, 1] - corner[0, 1], corner[2, 2] - corner[0, 2]
     x, y, z = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
@@ -107,14 +107,14 @@ def plane_of(corner: Floats) -> Plane:
 
 @cached(inline="always", **PLAIN)
 def turned(edge: Edge, up: float, cos: float, sin: float, slope: float) -> tuple[float, float, float]:
-    """An edge's normal for a ring: of x and y of its columns, without the phase, and of 1."""
+    """Return an edge's normal for a ring: of x and y of its columns, without the phase, and of 1."""
     x, y = edge.x + up * edge.x_up, edge.y + up * edge.y_up
     return x * cos + y * sin, y * cos - x * sin, edge.up * slope
 
 
 @cached(inline="always", **PLAIN)
 def passes(f: float, g: float, h: float) -> bool:
-    """Whether a ray lies on one side of the three planes through the edges, whichever way around they go."""
+    """Return whether a ray is on one side of the three planes through the edges, in either orientation."""
     return (f >= 0 and g >= 0 and h >= 0) or (f <= 0 and g <= 0 and h <= 0)
 
 
@@ -122,8 +122,8 @@ def passes(f: float, g: float, h: float) -> bool:
 def cast_triangles(
     triangles: Floats, surface: Floats, owners: Ints, salts: Ints, rays: Rays, nearest: NearestHits, key: int
 ) -> None:
-    """Keep the nearest hit of triangles (T,3,3); count what each object alone would stop."""
-    # Taken out of their tuples once: numba counts references at every access.
+    """Keep the nearest hit of triangles (T,3,3); count the rays that each object alone would stop."""
+    # Unpacked from their tuples once: numba counts references at every access.
     slopes, stretch, origins, phase_counts = rays.slope, rays.stretch, rays.origin_z_m, rays.phase_counts
     cos_phase, sin_phase, cos_azimuth, sin_azimuth = rays.cos_phase, rays.sin_phase, rays.cos_azimuth, rays.sin_azimuth
     first_column, number, counted = rays.first_column, rays.number, rays.counted

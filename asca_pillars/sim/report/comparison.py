@@ -1,4 +1,4 @@
-"""The statistics of a folder beside KITTI's: row by row, and whether each is as near as it should be."""
+"""Comparison of a folder's statistics with KITTI's, row by row, each with a tolerance."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -36,9 +36,9 @@ _GROUP = 5
 
 
 def jensen_shannon(first: ArrayLike, second: ArrayLike) -> NDArray[np.float64]:
-    """Distance (...) of histograms (..., B) of any positive sums: 0 for equal shapes, 1 where they share nothing.
+    """Return the Jensen-Shannon distance (...) of histograms (..., B) of any positive sums: 0 if equal, 1 if disjoint.
 
-    The square root of the divergence in bits, so that it is a metric and ends at 1; `jensenshannon` of SciPy gives
+    The square root of the divergence in bits, so that it is a metric of at most 1; `jensenshannon` of SciPy gives
     the same with `base=2`, and 0.83 of it with its default, natural logarithms.
     """
     p, q = np.asarray(first, np.float64), np.asarray(second, np.float64)
@@ -50,10 +50,10 @@ def jensen_shannon(first: ArrayLike, second: ArrayLike) -> NDArray[np.float64]:
 
 
 def coarse(counts: ArrayLike) -> NDArray[np.float64]:
-    """Reflectances (..., 100) in steps of 0.01 as (..., 21): exactly 0, then 20 bins of 0.05.
+    """Group reflectances (..., 100) in steps of 0.01 to (..., 21): exactly 0, then 20 bins of 0.05.
 
     A real histogram of a few hundred points has most of its hundred bins empty or nearly so: compared bin by bin with
-    any other it would be far away. What is reported as 0 is a kind of its own, no dark shade.
+    any other it would be far away. Reflectances reported as 0 are a separate bin, not dark ones.
     """
     fine = np.asarray(counts, np.float64)
     groups = fine.reshape(*fine.shape[:-1], -1, _GROUP).sum(axis=-1)
@@ -62,14 +62,14 @@ def coarse(counts: ArrayLike) -> NDArray[np.float64]:
 
 
 def noise_of_points(counts: ArrayLike, size: int) -> float:
-    """Mean distance of a histogram (B,) from `size` points drawn from it."""
+    """Return the mean distance of a histogram (B,) from `size` points sampled from it."""
     shares = np.asarray(counts, np.float64) / np.sum(counts)
     draws = np.random.default_rng(0).multinomial(size, shares, _DRAWS)
     return float(jensen_shannon(draws, shares).mean())
 
 
 def noise_of_units(stack: NDArray[np.float64], units: int) -> float:
-    """Mean distance of the sum of histograms (U, B) from that of `units` of them drawn at random.
+    """Return the mean distance of the sum of histograms (U, B) from that of `units` of them sampled at random.
 
     The points of one object share its paint or its clothes: a few objects differ from many by more than as many
     independent points would.
@@ -80,12 +80,12 @@ def noise_of_units(stack: NDArray[np.float64], units: int) -> float:
 
 
 MAX_SCANS = 300
-"""Scans that are read; their means are known to a percent by then. Labels are cheap and read of every frame."""
+"""Scans that are read, enough for means to within a percent. Labels are cheap and read of every frame."""
 
 
 @dataclass(frozen=True)
 class Measured:
-    """The statistics of a data set, and what each of its scans added: the spread among them tells chance apart."""
+    """Statistics of a data set, and the contribution of each scan: their spread gives the noise."""
 
     statistics: Statistics
     records: Sequence[ScanRecord]
@@ -114,7 +114,7 @@ def measure(root: str | Path, *, max_scans: int = MAX_SCANS, progress: bool = Tr
 
 RATIO_BAR = 0.15
 DISTANCE_BAR = 0.15
-MIN_DRIVES = 3  # drives of KITTI that know a statistic, from which on they say how far it may be off
+MIN_DRIVES = 3  # drives of KITTI with a statistic, needed for its tolerance
 MIN_FIT_BAR = 0.03
 BARRED_RANGES_M = (10, 20, 30, 40)
 CAR_RANGES_M = (*BARRED_RANGES_M, 50)
@@ -144,18 +144,18 @@ Measure = Literal["ratio", "difference", "distance"]
 
 @dataclass(frozen=True)
 class Row:
-    """One thing compared.
+    """Compared quantity.
 
     Attributes:
-        group: heading under which the row stands.
-        real, simulated: the two values; of histograms their means, where these say something.
-        measure: what `value` is: simulated / real, simulated - real, or the Jensen-Shannon distance.
-        bar: how far a ratio may be from 1, a difference from 0, or how large a distance; None where the row is for
-            information.
-        noise: what chance alone would do, where it is known: the standard error of a ratio or a difference; the
-            distance to expect of as few objects (or scans) as the real reflectances come from, or of as few labels as
-            this set has.
-        noise_of_points: the distance to expect of as many independent points as the real reflectances are.
+        group: heading of the row.
+        real, simulated: the two values; means of histograms, where meaningful.
+        measure: meaning of `value`: simulated / real, simulated - real, or the Jensen-Shannon distance.
+        bar: tolerance: largest deviation of a ratio from 1 or a difference from 0, or largest distance; None if the row
+            is for information.
+        noise: noise, where known: the standard error of a ratio or a difference; the
+            expected distance of as few objects (or scans) as for the real reflectances, or of as few labels as in
+            this set.
+        noise_of_points: the expected distance of as many independent points as there are real reflectances.
     """
 
     group: str
@@ -170,7 +170,7 @@ class Row:
 
     @property
     def within(self) -> bool | None:
-        """Whether the row keeps its bar; None without one."""
+        """Whether the value is within the tolerance; None without one."""
         if self.bar is None:
             return None
         return self.value < self.bar if self.measure == "distance" else self.away <= self.bar
@@ -182,13 +182,13 @@ class Row:
 
     @property
     def within_noise(self) -> bool:
-        """True if a bar is missed by no more than the noise of so little real data."""
+        """Whether the tolerance is exceeded by no more than the noise of the real data."""
         return self.within is False and self.noise is not None and self.away <= self.noise
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """The rows, and sentences about rows that could not be made."""
+    """Rows, and sentences about rows that could not be computed."""
 
     real: Statistics
     simulated: Statistics
@@ -197,12 +197,12 @@ class Comparison:
 
     @property
     def missed(self) -> tuple[Row, ...]:
-        """Rows that do not keep their bar."""
+        """Rows outside their tolerance."""
         return tuple(row for row in self.rows if row.within is False)
 
 
 def compare(measured: Measured, real: Statistics) -> Comparison:
-    """All rows that both sides have the numbers for."""
+    """Return all rows for which both sides have the numbers."""
     ours = measured.statistics
     rows = [
         *_scan_rows(real.scan, ours.scan),
@@ -270,14 +270,14 @@ def _band_rows(real: ScanStatistics, ours: ScanStatistics) -> Iterator[Row]:
 
 
 def _fit_rows(real: Statistics, ours: Statistics) -> Iterator[Row]:
-    """The median of the drives, and whether this set is no farther from it than the drives are from each other."""
+    """Yield rows of the median over the drives, with the drives' own spread as the tolerance."""
     for name, drives in real.label_fit.items():
         if name not in ours.label_fit:
             continue
         (fit,) = ours.label_fit[name]
         middle = float(np.median([drive.middle for drive in drives]))
         spread = max(abs(drive.middle - middle) for drive in drives)
-        # A normal distribution holds four fifths of itself within 1.28 deviations; medians scatter by 1.25 / sqrt(n).
+        # A normal distribution has four fifths of its mass within 1.28 deviations; medians scatter by 1.25 / sqrt(n).
         noise = 1.25 * (fit.high - fit.low) / 2.56 / np.sqrt(fit.objects)
         bar = max(spread, MIN_FIT_BAR) if len(drives) >= MIN_DRIVES else None
         group = "where points lie in their labels (m, shares)"

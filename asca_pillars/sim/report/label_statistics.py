@@ -1,4 +1,4 @@
-"""Statistics of labels: number, size, place, heading and occlusion of objects, and the fit of boxes to points."""
+"""Statistics of labels: number, size, position, yaw and occlusion of objects, and the fit of boxes to points."""
 
 from collections.abc import Mapping, Sequence
 
@@ -28,9 +28,9 @@ _ASIDE_RAD = np.pi / 12
 
 
 def label_statistics(split: KittiSplit, frame_ids: Sequence[str]) -> tuple[dict[str, LabelStatistics], float]:
-    """The labels of each of CLASSES that occurs in the frames, and the DontCare areas per frame.
+    """Return the label statistics of each of CLASSES that occurs in the frames, and the DontCare areas per frame.
 
-    KITTI labels what stands in the image; in a set that is labelled all around, the others are left out.
+    KITTI labels objects in the image; in a set labelled in every direction, the others are left out.
 
     Raises:
         DatasetError: a label or calibration file is missing or damaged.
@@ -93,7 +93,7 @@ def _band(values: Floats) -> Band | None:
 
 
 WINDOW_RETURNS = "window_returns"
-"""Points per height on side windows over those on the doors below them; cars seen neither end-on nor broadside."""
+"""Points per height on side windows over those on the doors below them; cars neither end-on nor side-on."""
 SHOWN: Mapping[str, tuple[str, ...]] = {
     "Car": (
         "flank_end",
@@ -111,13 +111,13 @@ SHOWN: Mapping[str, tuple[str, ...]] = {
     "Cyclist": ("range_5", "range_50", "range_95", "range_spread"),
 }
 COLUMNS = (*STATISTICS, WINDOW_RETURNS)
-MEANS = ("low_inside",)  # shares of objects, of which a median says nothing
+MEANS = ("low_inside",)  # fractions of objects, for which a median is meaningless
 MIN_OBJECTS = 2
 _MAX_TRUNCATION = 0.1
 _WINDOW_RANGE_M = 25.0
 _WINDOW_VIEW_DEG = 10.0, 73.0
-_WINDOWS, _DOORS = (0.68, 0.82), (0.35, 0.55)  # shares of the height
-_BESIDE_FRONT_SEATS = -0.25, 0.05  # shares of the length ahead of the center
+_WINDOWS, _DOORS = (0.68, 0.82), (0.35, 0.55)  # fractions of the height
+_BESIDE_FRONT_SEATS = -0.25, 0.05  # fractions of the length ahead of the center
 _FLANK_M = 0.3
 _MIN_DOOR_POINTS = 9
 
@@ -125,12 +125,12 @@ _MIN_DOOR_POINTS = 9
 def object_fits(
     points: NDArray[np.floating], objects: Sequence[KittiObject], boxes: NDArray[np.floating]
 ) -> dict[str, Floats]:
-    """`COLUMNS` of the objects of each class, (objects, len(COLUMNS)), that are neither hidden nor cut.
+    """Return `COLUMNS` of the unoccluded, untruncated objects of each class, (objects, len(COLUMNS)).
 
     Args:
-        points: (N, >=3) of the scan, metres.
+        points: (N, >=3) points of the scan, metres.
         objects: M labels with a 3D box.
-        boxes: (M, 7) of these in the frame of the points.
+        boxes: (M, 7) their boxes in the frame of the points.
     """
     whole = np.array([item.occluded == 0 and item.truncated <= _MAX_TRUNCATION for item in objects], bool)
     names = np.array([item.type for item in objects])
@@ -143,7 +143,7 @@ def object_fits(
 
 
 def window_returns(points: NDArray[np.floating], box: Floats) -> float:
-    """`WINDOW_RETURNS` of a car's box (7,), or NaN where too little of its doors is seen."""
+    """Return `WINDOW_RETURNS` of a car's box (7,), or NaN if too little of its doors is visible."""
     x, y, z, length, width, height, yaw = box
     if np.hypot(x, y) > _WINDOW_RANGE_M or not _WINDOW_VIEW_DEG[0] < view_angle_deg(box[None])[0] < _WINDOW_VIEW_DEG[1]:
         return float("nan")
@@ -159,10 +159,10 @@ def window_returns(points: NDArray[np.floating], box: Floats) -> float:
 
 
 def fits_of(rows: Mapping[str, Floats], source: str) -> dict[str, tuple[Fit, ...]]:
-    """One `Fit` for each shown statistic, by "Car flank_end" and the like, of MIN_OBJECTS or more.
+    """Return one `Fit` for each shown statistic, by "Car flank_end" and the like, of MIN_OBJECTS or more.
 
     Args:
-        rows: by class, as `object_fits` gives them, of one drive or folder.
+        rows: by class, from `object_fits`, of one drive or folder.
         source: its name.
     """
     result: dict[str, tuple[Fit, ...]] = {}

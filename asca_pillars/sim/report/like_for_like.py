@@ -1,4 +1,4 @@
-"""A simulated folder beside a labelled real one: objects at like distance, view and occlusion, and clusters."""
+"""Comparison of a simulated folder with a labelled real one at equal distance, view and occlusion, and of clusters."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
@@ -19,28 +19,28 @@ from asca_pillars.geometry.overlap import bev_iou
 from asca_pillars.scans.scan_reader import read_scan
 from asca_pillars.sim.report.reference import CLASSES
 
-BRIGHT = 0.5  # reflectance from which on a return is bright: plates, lamps, reflectors, pale paint
+BRIGHT = 0.5  # least reflectance of bright returns: plates, lamps, reflectors, pale paint
 PILLAR_M = 0.16
-LOWEST, WHEELS, MIDDLE = (0.0, 0.12), (0.12, 0.30), (0.50, 0.70)  # zones, in shares of the box's height
-SCORED_IOU = 0.25  # BEV IoU from which on a detection of the class is one of the object
+LOWEST, WHEELS, MIDDLE = (0.0, 0.12), (0.12, 0.30), (0.50, 0.70)  # zones, as fractions of the box's height
+SCORED_IOU = 0.25  # least BEV IoU of an object's detection
 
 _Points = NDArray[np.float32]
 
 
 class ObjectRecord(NamedTuple):
-    """A labelled object and its returns.
+    """Labelled object and its returns.
 
     Attributes:
         class_name: one of CLASSES.
-        distance_m: horizontal, from the sensor.
-        view_deg: 0..90 between the heading and the line of sight; 90 is seen from the side.
+        distance_m: horizontal distance from the sensor.
+        view_deg: angle 0..90 between the heading and the line of sight; 90 is side-on.
         occluded: KITTI's state, 0..3.
-        points: returns in the box, at least 1.
-        lowest, wheels, middle: shares of them in the zones LOWEST, WHEELS and MIDDLE of the height.
-        length_m: how much of the box's length they cover.
-        bright: share of them with a reflectance of BRIGHT or more.
-        pillars: cells of PILLAR_M that hold one.
-        score: of the best detection of its class there; 0 for none, NaN without a detector.
+        points: number of returns in the box, at least 1.
+        lowest, wheels, middle: fractions of them in the zones LOWEST, WHEELS and MIDDLE of the height.
+        length_m: length of the box that they cover.
+        bright: fraction of them with a reflectance of BRIGHT or more.
+        pillars: number of occupied cells of PILLAR_M.
+        score: score of the best detection of its class there; 0 without one, NaN without a detector.
     """
 
     class_name: str
@@ -60,12 +60,12 @@ class ObjectRecord(NamedTuple):
 def record_objects(
     points: _Points, objects: Sequence[KittiObject], boxes: NDArray[np.float32], detections: Detections | None
 ) -> list[ObjectRecord]:
-    """Records of the objects of CLASSES that have returns.
+    """Return records of the objects of CLASSES that have returns.
 
     Args:
-        points: (N, 4) of the scan, LiDAR frame.
+        points: (N, 4) points of the scan, LiDAR frame.
         objects: M labels with a 3D box.
-        boxes: (M, 7) of these, LiDAR frame.
+        boxes: (M, 7) their boxes, LiDAR frame.
         detections: detections in the scan; None without a detector.
     """
     inside = points_in_boxes(points, boxes)
@@ -77,7 +77,7 @@ def record_objects(
 
 
 def seen_objects(objects: Sequence[KittiObject]) -> list[KittiObject]:
-    """Those with a 3D box that the image shows."""
+    """Return the objects with a 3D box that are in the image."""
     return [item for item in objects if item.has_box_3d and item.bbox[2] > item.bbox[0]]
 
 
@@ -139,11 +139,11 @@ class LikeRow:
     Attributes:
         class_name: or ALL.
         measure: a key of MEASURES.
-        objects: real ones that were compared.
-        real, simulated: means over the objects, and over the means of their look-alikes; of counts, geometric means,
+        objects: number of real objects compared.
+        real, simulated: means over the objects, and over the means of their neighbors; for counts, geometric means,
             because near objects have a thousand times the returns of far ones.
-        ratio: real / simulated, and the interval that holds it with 95 %.
-        percentile: mean percentile of the real objects among their look-alikes, and its standard error.
+        ratio: real / simulated, and its 95 % interval.
+        percentile: mean percentile of the real objects among their nearest neighbors, and its standard error.
     """
 
     class_name: str
@@ -158,7 +158,7 @@ class LikeRow:
 
 
 def compare_objects(real: Sequence[ObjectRecord], simulated: Sequence[ObjectRecord]) -> list[LikeRow]:
-    """Rows of each class that both sides have (of scores one of all classes, too)."""
+    """Return rows of each class that both sides have (for scores also one of all classes)."""
     rows, scores = [], []
     for name in CLASSES:
         ours = [record for record in real if record.class_name == name]
@@ -182,20 +182,20 @@ def compare_objects(real: Sequence[ObjectRecord], simulated: Sequence[ObjectReco
 def look_alikes(
     real: Sequence[ObjectRecord], simulated: Sequence[ObjectRecord], *, like_points: bool = False
 ) -> NDArray[np.int64]:
-    """Indices (R, NEIGHBORS) of each real object's look-alikes among simulated ones of its class."""
+    """Return the indices (R, NEIGHBORS) of each real object's nearest neighbors among simulated ones of its class."""
     from_real, from_simulated = _place(real, like_points), _place(simulated, like_points)
     away = np.linalg.norm(from_real[:, None] - from_simulated[None], axis=2)
     return np.argsort(away, axis=1, kind="stable")[:, :NEIGHBORS]
 
 
 def percentiles(value: NDArray[np.float64], among: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Percentile 0..1 of each value (R,) among (R, K); ties count half."""
+    """Return the percentile 0..1 of each value (R,) among (R, K); ties count half."""
     below, same = (among < value[:, None]).mean(axis=1), (among == value[:, None]).mean(axis=1)
     return np.asarray(below + 0.5 * same)
 
 
 def _place(records: Sequence[ObjectRecord], like_points: bool) -> NDArray[np.float64]:
-    """Positions of objects in the space of matching (N, 3 or 4), each axis in units of its span."""
+    """Return positions of objects in the space of matching (N, 3 or 4), each axis in units of its span."""
     columns = [
         [np.log(record.distance_m) / DISTANCE_SPAN for record in records],
         [record.view_deg / VIEW_SPAN_DEG for record in records],
@@ -236,15 +236,15 @@ KINDS = {
     "bright": "bright ones of these (mean reflectance >= 0.45)",
 }
 _CELL_M = 0.25
-_FOOT_M = 0.2  # lower returns may be ground, and join what stands on it
-_MIN_POINTS = 10  # fewer have no shape
-_NEAR_M = 0.7  # from a cluster's middle to that of a box that fires at it
+_FOOT_M = 0.2  # lower returns may be ground, which would connect clusters
+_MIN_POINTS = 10  # clusters of fewer are ignored
+_NEAR_M = 0.7  # largest distance between a cluster's center and that of a detected box
 _AROUND_LABEL_M = 0.4
 
 
 @dataclass(frozen=True)
 class Cluster:
-    """A cluster of returns: middle, height above the ground and the longer side of its footprint in metres."""
+    """Cluster of returns: center, height above the ground and the longer side of its footprint in metres."""
 
     x_m: float
     y_m: float
@@ -255,7 +255,7 @@ class Cluster:
 
     @property
     def kinds(self) -> tuple[str, ...]:
-        """The keys of KINDS that it belongs to."""
+        """Keys of KINDS that apply."""
         if self.width_m >= THIN_M or self.height_m < PERSON_HEIGHT_M[0]:
             return ()
         size = "person" if self.height_m <= PERSON_HEIGHT_M[1] else "tall"
@@ -264,7 +264,7 @@ class Cluster:
 
 @dataclass(frozen=True)
 class FiringRow:
-    """Clusters of one kind: how many per frame, and the share of them that fire with its standard error."""
+    """Clusters of one kind: number per frame, and the fraction with a detection with its standard error."""
 
     kind: str
     frames: int
@@ -274,19 +274,19 @@ class FiringRow:
 
     @property
     def per_frame(self) -> float:
-        """Clusters of this kind in one frame, on average."""
+        """Mean number of clusters of this kind per frame."""
         return self.clusters / self.frames
 
 
 def find_clusters(
     points: NDArray[np.float32], ignored: NDArray[np.bool_], labelled: NDArray[np.float32], detections: Detections
 ) -> list[Cluster]:
-    """Clusters of at least _MIN_POINTS returns above the ground that touch no labelled box, widened a little.
+    """Find clusters of at least _MIN_POINTS returns above the ground that touch no labelled box, slightly widened.
 
     Args:
         points: (N, 4), LiDAR frame.
         ignored: (N,) mask of points in DontCare areas, whose objects are not labelled.
-        labelled: (M, 7) boxes of everything that has a label, LiDAR frame.
+        labelled: (M, 7) boxes of all labelled objects, LiDAR frame.
         detections: detections in the scan.
     """
     ground = fit_ground(points)
@@ -307,7 +307,7 @@ def find_clusters(
 
 
 def connected(xy_m: NDArray[np.float32]) -> NDArray[np.int64]:
-    """Numbers (N,) of the groups of points (N, 2) whose cells of _CELL_M touch."""
+    """Return group numbers (N,) of points (N, 2) whose cells of _CELL_M are connected."""
     cell = np.floor(xy_m / _CELL_M).astype(np.int64)
     cell -= cell.min(axis=0)
     raster = np.zeros(cell.max(axis=0) + 1, np.uint8)
@@ -317,13 +317,13 @@ def connected(xy_m: NDArray[np.float32]) -> NDArray[np.int64]:
 
 
 def firing_rows(clusters: Sequence[Cluster], frames: int) -> list[FiringRow]:
-    """A row of each kind."""
+    """Return a row of each kind."""
     rows = []
     for kind in KINDS:
         fires = np.array([cluster.fires for cluster in clusters if kind in cluster.kinds], bool)
         count = len(fires)
         share = float(fires.mean()) if count else float("nan")
-        # Laplace's estimate in the error alone: none of a few is not a share of 0 for certain.
+        # Laplace's estimate in the error alone: none of a few is not certainly a fraction of 0.
         likely = (fires.sum() + 1) / (count + 2)
         rows.append(FiringRow(kind, frames, count, share, float(np.sqrt(likely * (1 - likely) / max(count, 1)))))
     return rows
@@ -338,7 +338,7 @@ def _cluster(points: NDArray[np.float32], height: NDArray[np.float64], firing: N
 Detect = Callable[[NDArray[np.float32]], Detections]
 MAX_FRAMES = 400
 MIN_SCORE = 0.02
-"""Lowest score that a detector should report for the comparison; what is found with less counts as 0."""
+"""Lowest score that a detector should report for the comparison; lower ones count as 0."""
 
 
 @dataclass(frozen=True)
@@ -353,7 +353,7 @@ class Side:
 
 @dataclass(frozen=True)
 class LikeForLike:
-    """Both sides, and the rows that compare them; firing rates are None without a detector."""
+    """Both sides, and the rows that compare them; detection rates are None without a detector."""
 
     real: Side
     simulated: Side
@@ -362,7 +362,7 @@ class LikeForLike:
     detector: str | None
 
     def to_json(self) -> dict[str, Any]:
-        """All numbers; what is not one (a share of no clusters) is null."""
+        """Return all numbers; None for undefined ones (a fraction of no clusters)."""
         firing = None
         if self.firing is not None:
             names = ("real", "simulated")
@@ -376,7 +376,7 @@ class LikeForLike:
 
 
 def measure_side(root: str | Path, detect: Detect | None, title: str) -> Side:
-    """Measure the frames of `root`/training, at most MAX_FRAMES, evenly spaced; of each what the camera sees.
+    """Measure the frames of `root`/training, at most MAX_FRAMES, evenly spaced, in the camera's field of view.
 
     Raises:
         DatasetError: there is no scan, or a frame without labels or calibration.
@@ -433,7 +433,7 @@ def compare_like_for_like(
 def _in_areas(
     points: NDArray[np.float32], areas: Sequence[tuple[float, float, float, float]], calibration: Calibration
 ) -> NDArray[np.bool_]:
-    """Mask of the points (N, 4), all of them in the image, in one of its areas x1, y1, x2, y2."""
+    """Return the mask of the points (N, 4), all of them in the image, in one of its areas x1, y1, x2, y2."""
     u, v = calibration.project(points)[0].T
     inside = np.zeros(len(points), bool)
     for x1, y1, x2, y2 in areas:

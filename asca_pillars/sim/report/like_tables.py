@@ -1,4 +1,4 @@
-"""The comparison of like with like as text and as a picture."""
+"""Comparison of matched objects as text and as a picture."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -35,7 +35,7 @@ PICTURE = "like_for_like.png"
 
 
 def print_like(result: LikeForLike, console: Console) -> None:
-    """Both tables on the console."""
+    """Print both tables on the console."""
     console.print(title(result), style="bold", highlight=False, soft_wrap=True)
     for columns, rows, left in _tables(result):
         table = Table(box=box.SIMPLE, padding=(0, 1, 0, 0))
@@ -49,7 +49,7 @@ def print_like(result: LikeForLike, console: Console) -> None:
 
 
 def title(result: LikeForLike) -> str:
-    """Title of the report: the two sets that are compared."""
+    """Return the title of the report: the two compared sets."""
     return (
         f"{result.simulated.source} ({result.simulated.frames} frames) beside objects of {result.real.source} "
         f"({result.real.frames} frames), like with like"
@@ -57,7 +57,7 @@ def title(result: LikeForLike) -> str:
 
 
 def notes(result: LikeForLike) -> list[str]:
-    """Notes for the reader of the tables."""
+    """Return notes on the tables."""
     lines = [
         f"Each real object is compared with the {NEIGHBORS} simulated ones of its class that are nearest to it in "
         "distance, angle of view and occlusion (for scores, in points, too); of points and pillars geometric means.",
@@ -110,7 +110,7 @@ def _firing_cells(real: FiringRow, simulated: FiringRow) -> tuple[str, ...]:
 
 
 def _draw(path: Path, result: LikeForLike) -> None:
-    """Percentiles of each measure by class, and where firing rates are known, these."""
+    """Draw the percentiles of each measure by class, and the detection rates of clusters, if known."""
     figure, axes = new_figure(1, 1 if result.firing is None else 2, 6.5, 5.0)
     _draw_percentiles(axes[0], result)
     if result.firing is not None:

@@ -1,4 +1,4 @@
-"""The comparison as pictures; the only part of the report that needs matplotlib."""
+"""Plots of the comparison; the only part of the report that needs matplotlib."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -45,7 +45,7 @@ def write_plots(folder: Path, comparison: Comparison, measured: Measured, sensor
 
 
 def new_figure(rows: int, columns: int, width: float, height: float) -> tuple["Figure", list["Axes"]]:
-    """A figure of `rows` by `columns` plots of `width` by `height` inches, and these plots."""
+    """Return a figure of `rows` by `columns` plots of `width` by `height` inches, and these plots."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(width * columns, height * rows), layout="tight", dpi=100)
@@ -54,7 +54,7 @@ def new_figure(rows: int, columns: int, width: float, height: float) -> tuple["F
 
 def save_figure(path: Path, figure: "Figure") -> str:
     """Write a figure as PNG; its file name."""
-    # Neither pyplot nor its backends: a figure of its own leaves no global state and needs no display.
+    # No pyplot and no backend: a Figure object has no global state and needs no display.
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
     with atomic_path(path) as temporary:
@@ -63,7 +63,7 @@ def save_figure(path: Path, figure: "Figure") -> str:
 
 
 def _reflectance(comparison: Comparison) -> "Figure":
-    """Shares of the 21 bins, of each material; exactly 0 is the first."""
+    """Plot the fractions in the 21 bins, for each material; exactly 0 is the first."""
     real, ours = comparison.real.scan.reflectance, comparison.simulated.scan.reflectance
     rows = {row.name: row for row in comparison.rows}
     figure, plots = new_figure(2, 4, 4.0, 3.0)
@@ -83,7 +83,7 @@ def _reflectance(comparison: Comparison) -> "Figure":
 
 
 def _cars(comparison: Comparison, measured: Measured) -> "Figure":
-    """Points of unoccluded cars over distance, the fits, and the bars about KITTI's."""
+    """Plot points of unoccluded cars over distance, the fits, and the tolerances about KITTI's."""
     figure, (plot,) = new_figure(1, 1, 7.0, 5.0)
     cars = np.concatenate([record.cars for record in measured.records])
     plot.plot(cars[:, 0], cars[:, 1], ".", color=_OURS["color"], alpha=0.4, label="a car of this set")
@@ -111,7 +111,7 @@ def _cars(comparison: Comparison, measured: Measured) -> "Figure":
 
 
 def _scans(comparison: Comparison, sensor: Sensor) -> "Figure":
-    """Distribution of the returns of whole scans."""
+    """Plot the distribution of the returns of whole scans."""
     real, ours = comparison.real.scan, comparison.simulated.scan
     figure, (rings, sectors, ranges, heights, reflectances, last) = new_figure(2, 3, 5.0, 3.4)
     for side, style in ((real, _REAL), (ours, _OURS)):
@@ -142,7 +142,7 @@ def _scans(comparison: Comparison, sensor: Sensor) -> "Figure":
 
 
 def _labels(comparison: Comparison) -> "Figure":
-    """Distributions of the labels, a row for each class."""
+    """Plot distributions of the labels, a row for each class."""
     figure, plots = new_figure(len(CLASSES), 5, 3.7, 2.9)
     for index, name in enumerate(CLASSES):
         far, yaw, number, hidden, sizes = plots[5 * index : 5 * index + 5]

@@ -1,6 +1,6 @@
-"""The statistics that are compared, and those of KITTI that come with the package.
+"""Statistics that are compared, and those of KITTI in the package.
 
-What a scan that was cut to the camera's view cannot tell is None. Ranges are in metres, reflectances in hundredths.
+Statistics that scans cropped to the camera's view lack are None. Ranges are in metres, reflectances in hundredths.
 """
 
 import json
@@ -13,7 +13,7 @@ from asca_pillars.base.schema import parse
 from asca_pillars.base.strict import Strict
 
 CLASSES = ("Car", "Pedestrian", "Cyclist")
-BAND_M = 10.0  # of what is told by range, from 0 to 80 m
+BAND_M = 10.0  # of statistics by range, from 0 to 80 m
 BANDS = 8
 SECTORS = 72  # of 5 degrees of azimuth, counter-clockwise from straight ahead
 RANGE_BINS = 80  # of 1 m, of slant range
@@ -23,10 +23,10 @@ REFLECTANCES = 100  # 0.00 to 0.99
 MAX_PER_FRAME = 20
 PERCENTILES = (5, 25, 50, 75, 95)
 CAR_FIT_RANGE_M = (12.0, 70.0)
-"""Range of KITTI's cars in the fit. A power law holds piecewise only: fits are alike over the same span alone."""
+"""Range of KITTI's cars in the fit. A power law holds piecewise only: fits are comparable over the same span only."""
 NEAR_CARS_M = (12.0, 50.0)
-"""Beyond, cars have so few returns that one more or less turns the whole line, and many have no label."""
-TRUNCATION_EDGES = (0.0, 0.15, 0.30, 0.50)  # shares above the last are the fifth group
+"""Farther cars have so few returns that one changes the fit considerably, and many have no label."""
+TRUNCATION_EDGES = (0.0, 0.15, 0.30, 0.50)  # fractions above the last are the fifth group
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class Band(Strict):
 
 @dataclass(frozen=True)
 class Reflectance(Strict):
-    """A histogram of reflectance (REFLECTANCES,), and how many scans or objects its points come from."""
+    """Histogram of reflectance (REFLECTANCES,), and the number of scans or objects of its points."""
 
     counts: tuple[float, ...]
     units: int
@@ -60,7 +60,7 @@ class CarFit(Strict):
 
     Attributes:
         a, b: the line.
-        cars: that it was fitted to.
+        cars: number of cars in the fit.
         residual: standard deviation of the logarithms of the points about it.
         log_range: mean and standard deviation of the logarithms of the cars' ranges.
     """
@@ -72,11 +72,11 @@ class CarFit(Strict):
     log_range: Band
 
     def points_at(self, range_m: float) -> float:
-        """Returns that such a car has at `range_m`."""
+        """Return the number of returns of such a car at `range_m`."""
         return math.exp(self.a + self.b * math.log(range_m))
 
     def error_at(self, range_m: float) -> float:
-        """Relative standard error of `points_at`, from the scatter of the cars and their distance to `range_m`."""
+        """Return the relative standard error of `points_at`, from the scatter of the cars and their distance."""
         away = (math.log(range_m) - self.log_range.mean) / self.log_range.std
         return self.residual * math.sqrt((1 + away**2) / self.cars)
 
@@ -86,16 +86,16 @@ class ScanStatistics(Strict):
     """Statistics of scans; unless stated otherwise, means over the scans.
 
     Attributes:
-        scans: how many were measured.
+        scans: number of measured scans.
         points, camera_points: returns of a scan, and those in the image.
-        ground_share, camera_ground_share: of these returns.
-        points_per_ring: (rings,) from the top, None also where scans disagree about their number.
+        ground_share, camera_ground_share: fractions of ground among these returns.
+        points_per_ring: (rings,) from the top, None also if scans differ in their number.
         sector_points: (SECTORS,) points per 5 degrees of azimuth.
         range_points: (RANGE_BINS,) points per metre of slant range.
         ground_z_m, ground_reflectance: (BANDS,) of slant range, of all ground returns together.
         reflectance: by "overall", "ground", "non_ground" and the classes of objects in small letters. An object's
             points are those in its box more than 0.1 m above its bottom.
-        car_fit, near_car_fit: over CAR_FIT_RANGE_M and NEAR_CARS_M; None where there are too few cars.
+        car_fit, near_car_fit: over CAR_FIT_RANGE_M and NEAR_CARS_M; None with too few cars.
     """
 
     scans: int
@@ -118,14 +118,14 @@ class LabelStatistics(Strict):
     """Statistics of the labels of one class; boxes in the LiDAR frame.
 
     Attributes:
-        count: labelled objects.
-        per_frame: (MAX_PER_FRAME + 1,) frames with 0, 1, 2 ... objects; the last holds those with more, too.
+        count: number of labelled objects.
+        per_frame: (MAX_PER_FRAME + 1,) frames with 0, 1, 2 ... objects; the last includes those with more.
         height_m, width_m, length_m: sizes.
         left_m: the center's lateral position.
         range_counts: (LABEL_RANGE_BINS,) of horizontal distance.
         bottom_z_m: (BANDS,) of horizontal distance.
-        yaw_counts: (YAW_BINS,); 0 is our direction.
-        yaw_same, yaw_oncoming, yaw_across: shares within 15 degrees of ours, of the opposite, and across.
+        yaw_counts: (YAW_BINS,); 0 is the direction of the car.
+        yaw_same, yaw_oncoming, yaw_across: fractions within 15 degrees of the car's, of the opposite, and across.
         occlusion: (4,) objects of each state.
         truncation: (5,) objects truncated by nothing, up to 0.15, 0.30, 0.50, and by more.
     """
@@ -148,12 +148,12 @@ class LabelStatistics(Strict):
 
 @dataclass(frozen=True)
 class Fit(Strict):
-    """One statistic of how labels lie around points (`fit_statistics`), over the objects of one drive or folder.
+    """Statistic of the fit of labels to points (`fit_statistics`), over the objects of one drive or folder.
 
     Attributes:
         source: the drive or folder.
-        objects: of which the statistic is known.
-        middle: median over them; of a share, their mean.
+        objects: number of objects with the statistic.
+        middle: their median; of a fraction, their mean.
         low, high: 10th and 90th percentile.
     """
 
@@ -168,8 +168,8 @@ class Fit(Strict):
 class Statistics(Strict):
     """Statistics of a data set: its scans, the labels of CLASSES that occur, and DontCare areas per frame.
 
-    `label_fit` tells by "Car flank_end" and the like how labels lie around points: of KITTI drive by drive, because
-    the cars of a drive are few and one annotator's.
+    `label_fit` has the fit of labels to points by "Car flank_end" and the like: for KITTI by drive, because
+    the cars of a drive are few and labelled by one annotator.
     """
 
     source: str
@@ -182,7 +182,7 @@ class Statistics(Strict):
 
 @dataclass(frozen=True)
 class Sensor(Strict):
-    """KITTI's HDL-64E: a point of ring k at horizontal distance rho lies at z = origin_z_m[k] + rho tan(elevation)."""
+    """KITTI's HDL-64E: a point of ring k at horizontal distance rho has z = origin_z_m[k] + rho tan(elevation)."""
 
     elevation_deg: tuple[float, ...]
     origin_z_m: tuple[float, ...]
@@ -191,7 +191,7 @@ class Sensor(Strict):
 
 @dataclass(frozen=True)
 class Reference(Strict):
-    """KITTI's statistics and sensor, as they come with the package."""
+    """KITTI's statistics and sensor, as in the package."""
 
     statistics: Statistics
     sensor: Sensor
@@ -199,7 +199,7 @@ class Reference(Strict):
 
 @cache
 def kitti_reference() -> Reference:
-    """Statistics of real scans: those of KITTI that the package carries."""
+    """Return the statistics of KITTI's scans in the package."""
     name = "kitti_statistics.json"
     text = resources.files("asca_pillars.sim").joinpath(name).read_text(encoding="utf-8")
     return parse(Reference, json.loads(text), name)

@@ -1,4 +1,4 @@
-"""Statistics of scans: how many returns, where, how many of the ground, and how bright."""
+"""Statistics of scans: number of returns, their positions, fraction of ground, and reflectance."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -27,13 +27,13 @@ from asca_pillars.sim.report.reference import (
     Sensor,
 )
 
-_GROUND_M = 0.15  # ground lies within this of the local height
+_GROUND_M = 0.15  # largest distance of ground from the local height
 _PLANE_REACH_M = 20.0
 _SECTORS = 72  # of 5 degrees
 _STEP_M = 2.0
 _REACH_M = 80.0
-_SEARCH_M = 0.3  # from one cell to the next the local height is looked for this far from the one before
-_MIN_POINTS = 3  # fewer in a cell say nothing about its height
+_SEARCH_M = 0.3  # largest change of the local height from one cell to the next
+_MIN_POINTS = 3  # fewer in a cell do not determine its height
 _MAX_SLOPE = 0.15
 _TRIALS = 150
 _SAMPLE = 2000
@@ -42,7 +42,7 @@ _Floats = NDArray[np.floating[Any]]
 
 
 def ground_mask(points: _Floats) -> NDArray[np.bool_]:
-    """Mask (N,) of the ground points among (N, >=3), LiDAR frame in metres; all false where no plane is to be seen."""
+    """Return the mask (N,) of the ground points among (N, >=3), LiDAR frame in metres; all False without a plane."""
     x, y, z = points[:, :3].astype(np.float32).T
     radius = np.hypot(x, y)
     plane = most_common_ground(points[radius < _PLANE_REACH_M])
@@ -51,7 +51,7 @@ def ground_mask(points: _Floats) -> NDArray[np.bool_]:
     above = z - (plane[0] * x + plane[1] * y + plane[2])
     sector = np.minimum(((np.arctan2(y, x) + np.pi) * (_SECTORS / (2 * np.pi))).astype(np.int16), _SECTORS - 1)
     step = np.minimum(radius / _STEP_M, _REACH_M / _STEP_M - 1).astype(np.int16)
-    # Cells in the order in which the heights are tracked; small integers are sorted by radix.
+    # Cells in the order of tracking the heights; small integers are sorted by radix.
     order = np.argsort(step * _SECTORS + sector, kind="stable")
     starts = np.searchsorted(step[order], np.arange(int(_REACH_M / _STEP_M) + 1))
     above, sector = above[order], sector[order]
@@ -65,9 +65,9 @@ def ground_mask(points: _Floats) -> NDArray[np.bool_]:
 
 
 def most_common_ground(points: _Floats) -> NDArray[np.float64] | None:
-    """RANSAC plane (3,) a, b, c of z = a x + b y + c, metres, through points (N, >=3); None if no draw is level enough.
+    """Fit a RANSAC plane (3,) a, b, c of z = a x + b y + c, metres, to points (N, >=3); None if all are too steep.
 
-    The draws are seeded: the same points give the same plane.
+    The samples are seeded: the same points give the same plane.
     """
     if len(points) < _SECTORS:
         return None
@@ -88,7 +88,7 @@ def most_common_ground(points: _Floats) -> NDArray[np.float64] | None:
 
 
 def _track(height: NDArray[np.float64], cell: NDArray[np.int16], above: _Floats) -> NDArray[np.float64]:
-    """The local heights (S,) of the next ring of cells, from those of the ring before."""
+    """Return the local heights (S,) of the next ring of cells, from those of the previous ring."""
     candidate = np.abs(above - height[cell]) < _SEARCH_M
     count = np.bincount(cell[candidate], minlength=_SECTORS)
     total = np.bincount(cell[candidate], above[candidate], minlength=_SECTORS)
@@ -100,7 +100,7 @@ MATERIALS = ("overall", "ground", "non_ground", *OBJECTS)
 _ABOVE_BOTTOM_M = 0.1  # an object's points begin so far above its box's bottom: lower ones may be ground
 _CAMERA_VIEW_SHARE = 0.9  # of a scan's points; a whole revolution has about 0.16 of them in the image
 _MIN_CARS = 5
-_LAYERS = range(8, 161)  # rings that a stored scan may plausibly have
+_LAYERS = range(8, 161)  # plausible numbers of rings in a stored scan
 
 _Counts = NDArray[np.int64]
 
@@ -110,14 +110,14 @@ class ScanRecord:
     """Contribution of one scan to the statistics.
 
     Attributes:
-        points, in_camera, ground, ground_in_camera: returns.
+        points, in_camera, ground, ground_in_camera: numbers of returns.
         rings: (rings,) returns of each, from the top.
         sectors: (SECTORS,) returns of each, counter-clockwise from straight ahead.
         ranges: (RANGE_BINS,) returns per metre.
         ground_sums: (3, 2, BANDS) number, sum and sum of squares of z and of reflectance of ground returns.
         reflectance: by material, (units, REFLECTANCES) counts of the scan or of each object in it.
         cars: (C, 2) range and points of its unoccluded, untruncated cars.
-        fits: by class, as `fit_statistics.object_fits` gives them.
+        fits: by class, from `fit_statistics.object_fits`.
     """
 
     points: int
@@ -169,12 +169,12 @@ def measure_scan(split: KittiSplit, frame_id: str, sensor: Sensor) -> ScanRecord
 
 
 def is_camera_view(records: Sequence[ScanRecord]) -> bool:
-    """Whether any of the scans was cut to what the camera sees."""
+    """Return whether any of the scans was cropped to the camera's field of view."""
     return any(record.in_camera > _CAMERA_VIEW_SHARE * record.points for record in records)
 
 
 def scan_statistics(records: Sequence[ScanRecord]) -> ScanStatistics:
-    """The statistics of at least one scan; of those cut to the camera's view, only what they can tell."""
+    """Return the statistics of at least one scan; of those cropped to the camera's view, only the available ones."""
     whole = not is_camera_view(records)
     materials = MATERIALS if whole else OBJECTS
     stacks = {name: stack for name in materials if len(stack := unit_histograms(records, name))}
@@ -202,16 +202,16 @@ def scan_statistics(records: Sequence[ScanRecord]) -> ScanStatistics:
 
 
 def unit_histograms(records: Sequence[ScanRecord], material: str) -> _Counts:
-    """The reflectances (units, REFLECTANCES) of every scan or object of a material that has returns."""
+    """Return the reflectances (units, REFLECTANCES) of every scan or object of a material with returns."""
     parts = [record.reflectance[material] for record in records if material in record.reflectance]
     stack = np.concatenate(parts) if parts else np.zeros((0, REFLECTANCES), np.int64)
     return stack[stack.sum(axis=1) > 0]
 
 
 def fit_cars(cars: NDArray[np.float64], span_m: tuple[float, float]) -> CarFit | None:
-    """The power law through ranges and points (C, 2) of cars within a span, or None where it would be arbitrary.
+    """Fit a power law to ranges and points (C, 2) of cars within a span; None if it would be arbitrary.
 
-    As in the reference, a car without any point, of which there is no logarithm, is left out.
+    As in the reference, cars without points, which have no logarithm, are left out.
     """
     low_m, high_m = span_m
     cars = np.log(cars[(cars[:, 1] > 0) & (cars[:, 0] >= low_m) & (cars[:, 0] <= high_m)])
@@ -223,10 +223,10 @@ def fit_cars(cars: NDArray[np.float64], span_m: tuple[float, float]) -> CarFit |
 
 
 def ring_counts(points: NDArray[np.floating[Any]], sensor: Sensor) -> _Counts:
-    """Number of returns of each ring, counts (rings,) from the top, of a whole revolution (N, >=3).
+    """Return the number of returns of each ring, counts (rings,) from the top, of a whole revolution (N, >=3).
 
-    KITTI's files hold ring after ring, each from azimuth 0 on, counter-clockwise: where the azimuth falls back, the
-    next ring begins. In files of another order a return belongs to the ring of `sensor` whose beam passes nearest.
+    KITTI's files are ordered by ring, each from azimuth 0 on, counter-clockwise: where the azimuth decreases, the
+    next ring begins. In files of another order a return is assigned to the ring of `sensor` with the nearest beam.
     """
     starts = np.flatnonzero(np.diff(_azimuth(points)) < -np.pi) + 1
     if len(starts) + 1 in _LAYERS:
@@ -247,7 +247,7 @@ def ring_counts(points: NDArray[np.floating[Any]], sensor: Sensor) -> _Counts:
 def _objects(
     objects: Sequence[KittiObject], boxes: NDArray[np.float32], points: NDArray[np.float32], value: _Counts
 ) -> tuple[dict[str, _Counts], NDArray[np.float64]]:
-    """Reflectances of the objects of a frame by type, and range and points of its unhidden cars."""
+    """Return reflectances of the objects of a frame by type, and range and points of its unoccluded cars."""
     inside = points_in_boxes(points, boxes)
     body = inside & (points[:, None, 2] > boxes[:, 2] - boxes[:, 5] / 2 + _ABOVE_BOTTOM_M)
     types = np.array([item.type.lower() for item in objects])
@@ -274,7 +274,7 @@ def _mean(rows: Sequence[_Counts]) -> tuple[float, ...]:
 
 
 def _bands(sums: NDArray[np.float64]) -> tuple[Band | None, ...]:
-    """Mean and deviation in each band from (3, BANDS) numbers, sums and sums of squares."""
+    """Return mean and deviation in each band from (3, BANDS) numbers, sums and sums of squares."""
     bands: list[Band | None] = []
     for number, total, squares in sums.T:
         mean = total / max(number, 1)

@@ -26,7 +26,7 @@ _MEASURES = {"ratio": "x {:.2f}", "difference": "{:+.2f}", "distance": "JS {:.3f
 
 
 def print_comparison(comparison: Comparison, console: Console) -> None:
-    """The rows with a bar, and what was left out, on the console."""
+    """Print the rows with a tolerance, and notes on missing rows, on the console."""
     console.print(title(comparison), style="bold", highlight=False, soft_wrap=True)
     table = Table(box=box.SIMPLE, padding=(0, 1, 0, 0))
     for index, column in enumerate(_COLUMNS):
@@ -46,13 +46,13 @@ def print_comparison(comparison: Comparison, console: Console) -> None:
 
 
 def title(comparison: Comparison) -> str:
-    """Title of the report: the sets that are compared."""
+    """Return the title of the report: the compared sets."""
     ours, scan = comparison.simulated, comparison.simulated.scan
     return f"{ours.source}: {scan.scans} scans and the labels of {ours.frames} frames, beside KITTI"
 
 
 def notes(comparison: Comparison) -> list[str]:
-    """Notes for the reader: bars kept, parts left out, and the meaning of the distances."""
+    """Return notes: rows within tolerance, parts left out, and the meaning of the distances."""
     barred = [row for row in comparison.rows if row.within is not None]
     missed = "; ".join(row.name for row in comparison.missed)
     noisy = "; ".join(row.name for row in comparison.missed if row.within_noise)
@@ -78,7 +78,7 @@ def write_report(folder: Path, comparison: Comparison, plots: Sequence[str]) -> 
 
 
 def to_markdown(comparison: Comparison, plots: Sequence[str]) -> str:
-    """All rows as Markdown, a table for each group, and the named pictures."""
+    """Return all rows as Markdown, a table for each group, and the named pictures."""
     parts = [f"# {title(comparison)}\n", "\n".join([*(f"- {line}" for line in notes(comparison)), ""])]
     columns = [column.replace("\n", " ") for column in _COLUMNS]
     for group in dict.fromkeys(row.group for row in comparison.rows):
@@ -93,7 +93,7 @@ def to_markdown(comparison: Comparison, plots: Sequence[str]) -> str:
 
 
 def fits_table(fits: Mapping[str, Sequence[Fit]]) -> str:
-    """Medians of how labels lie around points, a column for each drive or folder, with the numbers of objects."""
+    """Return medians of the fit of labels to points, a column for each drive or folder, with the numbers of objects."""
     sources = list(dict.fromkeys(fit.source for of in fits.values() for fit in of))
     rows = []
     for name, of in fits.items():
@@ -104,7 +104,7 @@ def fits_table(fits: Mapping[str, Sequence[Fit]]) -> str:
 
 
 def to_json(comparison: Comparison) -> dict[str, Any]:
-    """The rows, what was left out, and the statistics of both sides."""
+    """Return the rows, notes on missing rows, and the statistics of both sides."""
     return {
         "rows": [_plain(row) for row in comparison.rows],
         "skipped": list(comparison.skipped),
@@ -128,7 +128,7 @@ def _cells(row: Row) -> tuple[str, ...]:
     bar = "" if row.bar is None else _BARS[row.measure].format(row.bar)
     within = {None: "", True: "yes", False: "NO"}[row.within]
     noise = "" if row.noise is None else f"{row.noise:.3f}" if row.measure == "distance" else f"+-{row.noise:.2f}"
-    value = _MEASURES[row.measure].format(row.value) if isfinite(row.value) else ""  # of nothing there is no ratio
+    value = _MEASURES[row.measure].format(row.value) if isfinite(row.value) else ""  # no ratio of 0 / 0
     return row.name, _number(row.real), _number(row.simulated), value, bar, within, noise
 
 

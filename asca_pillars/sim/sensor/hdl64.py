@@ -1,4 +1,4 @@
-"""The Velodyne HDL-64E that KITTI drove, as its scans show it: tables that a data sheet does not give."""
+"""The Velodyne HDL-64E of KITTI: tables fitted to its scans that a data sheet does not give."""
 
 # fmt: off
 # Fitted to points: laser k reaches z = origin_z[k] + rho tan(elevation[k]) at horizontal distance rho.
@@ -9,16 +9,16 @@ ELEVATION_DEG = (
     -14.048, -14.598, -15.189, -15.657, -16.177, -16.554, -17.187, -17.730, -18.323, -18.797, -19.320, -19.737,
     -20.222, -20.788, -21.318, -21.936, -22.438, -22.857, -23.323, -23.971, -24.507, -24.999,
 )
-# Leaving heights of the first and last laser of the upper and of the lower block, metres.
+# Origin heights of the first and last laser of the upper and of the lower block, metres.
 ORIGIN_Z_M = ((0.2091, 0.1978), (0.1258, 0.1163))
-# Reflectance that each laser reports of the same surface, over a typical laser: the same on every recording day.
+# Reflectance reported by each laser for the same surface, relative to a typical laser: constant over recording days.
 RING_GAIN = (
     1.22, 1.05, 0.96, 0.90, 1.15, 0.96, 1.22, 1.02, 1.19, 0.93, 1.05, 1.12, 1.22, 1.12, 1.00, 1.02, 1.06, 1.09,
     1.06, 0.92, 1.06, 0.69, 1.06, 1.12, 0.91, 1.03, 1.10, 1.12, 1.09, 0.82, 1.10, 1.08, 0.93, 0.93, 1.01, 0.64,
     0.45, 1.04, 1.23, 1.20, 0.93, 1.04, 0.56, 1.04, 1.04, 1.09, 1.09, 0.97, 0.86, 1.12, 1.23, 0.43, 1.01, 0.78,
     0.75, 1.01, 1.09, 1.23, 0.75, 0.75, 0.78, 1.12, 1.27, 1.20,
 )
-# Rings [first, beyond) that the own car hides, per 3 degrees of azimuth from straight ahead, counter-clockwise.
+# Rings [first, beyond) occluded by the own car, per 3 degrees of azimuth from straight ahead, counter-clockwise.
 EGO_FIRST_RING = (
     57, 57, 57, 58, 58, 60, 62, 64, 64, 61, 62, 61, 62, 64, 64, 64, 64, 64, 64, 64, 64, 64, 64, 64, 64, 64, 64,
     64, 64, 64, 64, 64, 64, 64, 64, 64, 64, 64, 64, 64, 64, 64, 57, 56, 56, 60, 61, 62, 63, 63, 61, 59, 53, 42,

@@ -1,10 +1,10 @@
-"""The spinning LiDAR: where each laser points at each firing, and what of the world it keeps.
+"""Spinning LiDAR: direction of each laser at each firing, and its measurement parameters.
 
 Every laser fires at counts of the azimuth encoder, in a repeating pattern of steps, and reports range and reflectance.
-What is drawn once per scan (calibration errors, thresholds) is drawn here; what is drawn per firing, in `returns`.
+Random numbers per scan (calibration errors, thresholds) are drawn here; those per firing, in `returns`.
 
-The scan is taken as if the car stood still: KITTI's scans are corrected for the car's own motion. Others move on while
-a scan is taken, but the laser sweeps over one in some milliseconds, in which it moves less than its label box is loose.
+The scan is taken as if the car did not move: KITTI's scans are corrected for ego motion. Others do move during
+a scan, but the laser sweeps over one in some milliseconds, in which it moves less than its label box is loose.
 """
 
 from dataclasses import dataclass, fields
@@ -16,23 +16,23 @@ from asca_pillars.base.errors import ConfigError
 from asca_pillars.base.strict import Strict
 from asca_pillars.sim.sensor import hdl64
 
-MAX_COLUMNS = 4096  # the ray caster tells firings apart by ring * 4096 + column
+MAX_COLUMNS = 4096  # the ray caster identifies firings by ring * 4096 + column
 
 
 @dataclass(frozen=True)
 class Lidar(Strict):
-    """A spinning LiDAR; the defaults are KITTI's HDL-64E. Angles in degrees, lengths in metres.
+    """Spinning LiDAR; the defaults are KITTI's HDL-64E. Angles in degrees, lengths in metres.
 
     Attributes:
-        elevation_deg: of each laser, from the top downwards.
-        origin_z_m: heights in the LiDAR frame at which the lasers leave it: first and last laser of each block of
-            equally many lasers from the top, evenly spaced between. Sensors that stand on each other are one list of
-            lasers whose blocks hold one laser each (configs/simulation/vlp_32c_pair.yaml).
+        elevation_deg: elevation of each laser, from the top downwards.
+        origin_z_m: origin heights of the lasers in the LiDAR frame: first and last laser of each block of
+            equally many lasers from the top, evenly spaced between. Stacked sensors are one list of
+            lasers whose blocks have one laser each (configs/simulation/vlp_32c_pair.yaml).
         azimuth_counts: encoder counts of one revolution.
         azimuth_steps: counts from each firing to the next, repeated.
-        ego_first_ring, ego_beyond_ring: rings [first, beyond) that the own car hides, per equal sector of azimuth from
+        ego_first_ring, ego_beyond_ring: rings [first, beyond) occluded by the own car, per equal sector of azimuth from
             straight ahead, counter-clockwise; empty for none.
-        range_m: nearest and farthest range that is reported.
+        range_m: nearest and farthest reported range.
     """
 
     elevation_deg: tuple[float, ...] = hdl64.ELEVATION_DEG
@@ -45,32 +45,32 @@ class Lidar(Strict):
     range_m: tuple[float, float] = (2.0, 80.0)
     range_sigma_m: tuple[float, float] = (0.005, 0.010)  # drawn once per scan
     ring_bias_sigma_m: float = 0.022  # with it, points of several rings on a plane spread over 2 to 3 cm
-    # A footprint that leans over an edge meets two surfaces: the share of firings that lean to either side, and
-    # the share of those that report nothing. KITTI misses one firing at every fifth step in depth.
+    # A footprint that straddles an edge hits two surfaces: the fraction of firings that straddle to either side, and
+    # the fraction of those without a return. KITTI lacks one firing at every fifth step in depth.
     beam_split_share: float = 0.3
     split_lost_share: float = 0.35
-    loss_share: tuple[float, float] = (0.0, 0.003)  # returns lost for no reason, drawn once per scan
+    loss_share: tuple[float, float] = (0.0, 0.003)  # returns lost at random, drawn once per scan
     # A return is kept without a reflectance below the first power, and lost below the second. Power is
     # reflectance * sqrt(cos(incidence)) / range^2; both thresholds are drawn together, once per scan.
     zero_power: tuple[float, float] = (2.5e-5, 7.5e-5)
     lost_share_of_zero_power: float = 0.2
-    # The true reflectance is reported through a power law about 0.4 (1: as it is) that starts at `dark_offset` below
-    # 0, times what each laser makes of it (empty: 1). Beyond `focus_m` it fades with exp(-((range - focus) / fade)^1.3)
-    # (0: not), and the lasers of the first block lose `near_fade` of it right before them.
+    # The true reflectance is reported through a power law about 0.4 (1: linear) that starts at `dark_offset` below
+    # 0, times the gain of each laser (empty: 1). Beyond `focus_m` it fades with exp(-((range - focus) / fade)^1.3)
+    # (0: not), and the lasers of the first block lose `near_fade` of it at zero range.
     response: float = 0.6
     dark_offset: float = 0.03
     ring_gain: tuple[float, ...] = hdl64.RING_GAIN
-    ring_gain_sigma: float = 0.06  # of the logarithm, once per scan: no two sensors have the same lasers
+    ring_gain_sigma: float = 0.06  # of the logarithm, once per scan: the lasers of two sensors differ
     focus_m: float = 13.0
     fade_m: float = 33.0
     near_fade: float = 0.4
-    # Noise of each report, of the first block and of the others; in proportion to it; and of a laser without gain.
+    # Noise of each report, of the first block and of the others; relative; and of a laser without gain.
     reflectance_sigma: tuple[float, float] = (0.04, 0.02)
     reflectance_sigma_share: float = 0.1
     weak_laser_sigma: float = 0.12
-    # Reflectances below a uniform draw up to this are reported as 0 too, of the first block and of the others.
+    # Reflectances below a uniform random number up to this are also reported as 0, of the first block and the others.
     faint_reflectance: tuple[float, float] = (0.2, 0.13)
-    zero_share: float = 0.03  # of all returns, reported as 0 for no reason: so the best lasers do on near, bright road
+    zero_share: float = 0.03  # of all returns, reported as 0 at random, as of the best lasers on near, bright road
     camera_half_angle_deg: float = 43.0
 
     def __post_init__(self) -> None:
@@ -112,16 +112,16 @@ class Lidar(Strict):
 
     @property
     def mean_step(self) -> float:
-        """Encoder counts from firing to firing, on average."""
+        """Mean number of encoder counts between firings."""
         return sum(self.azimuth_steps) / len(self.azimuth_steps)
 
 
 @dataclass(frozen=True)
 class Firings:
-    """The firings of one revolution, or of its part before the camera, and the state of the sensor for this scan.
+    """Firings of one revolution, or of its part in the camera's view, and the state of the sensor in this scan.
 
-    Firing (k, c) points at `azimuth_rad[c] + phase_rad[k]` with slope `slope[k]`. All chance of it belongs to its ring
-    and to the number that its column has in the whole revolution.
+    Firing (k, c) points at `azimuth_rad[c] + phase_rad[k]` with slope `slope[k]`. Its random numbers depend on its ring
+    and on the number of its column in the whole revolution.
     """
 
     slope: npt.NDArray[np.float64]  # (K,) tan(elevation)
@@ -136,9 +136,9 @@ class Firings:
     number: npt.NDArray[np.int64]  # (C,) of each column among those of the whole revolution
     columns_per_turn: int
     first_column: npt.NDArray[np.int64]  # (counts + 1,) first column at or after an encoder count
-    counted: npt.NDArray[np.bool_]  # (C,) columns whose firings tell how much of an object is hidden
+    counted: npt.NDArray[np.bool_]  # (C,) columns whose firings determine the visible fraction of an object
     hidden: npt.NDArray[np.bool_]  # (K,C) firings that the ego vehicle blocks
-    outside: npt.NDArray[np.bool_]  # (K,C) firings whose returns are not asked for
+    outside: npt.NDArray[np.bool_]  # (K,C) firings whose returns are not needed
     range_sigma_m: float
     loss_share: float
     zero_power: float
@@ -146,18 +146,18 @@ class Firings:
 
     @property
     def lost_power(self) -> float:
-        """The received power below which a firing returns nothing in this scan."""
+        """Received power below which a firing has no return in this scan."""
         return self.zero_power * self.lidar.lost_share_of_zero_power
 
 
 def draw_firings(lidar: Lidar, rng: np.random.Generator, camera_only: bool, count_all_around: bool = False) -> Firings:
-    """The firings of one scan.
+    """Draw the firings of one scan.
 
     Args:
         lidar: the sensor.
-        rng: of the scan; each call draws the same number of values from it.
-        camera_only: skip the columns that the camera does not see, and leave every random number as it is.
-        count_all_around: how much of an object is hidden is told by all columns, not by the camera's alone.
+        rng: generator of the scan; each call draws the same number of values from it.
+        camera_only: skip the columns outside the camera's view, without changing any random number.
+        count_all_around: compute the visible fraction of objects from all columns, not from the camera's alone.
     """
     rings, per_block = lidar.rings, lidar.rings // len(lidar.origin_z_m)
     origin_z = np.concatenate([np.linspace(*block, per_block) for block in lidar.origin_z_m])
@@ -199,7 +199,7 @@ def draw_firings(lidar: Lidar, rng: np.random.Generator, camera_only: bool, coun
 
 
 def _hidden(lidar: Lidar, azimuth_rad: npt.NDArray[np.float64]) -> npt.NDArray[np.bool_]:
-    """(K,C) firings that the ego vehicle blocks."""
+    """Return (K,C) firings that the ego vehicle blocks."""
     if not lidar.ego_first_ring:
         return np.zeros((lidar.rings, len(azimuth_rad)), bool)
     sector = (azimuth_rad / (2 * np.pi) * len(lidar.ego_first_ring)).astype(int)

@@ -1,6 +1,6 @@
-"""From what each firing met to the points that the sensor reports: power, edges, noise, loss, rounding.
+"""Points reported by the sensor from the hits of its firings: power, edges, noise, loss, rounding.
 
-The kernels are compiled by numba; `casting.rays` says what that means for changes of another file.
+The kernels are compiled by numba; see `casting.rays` on changes of other files.
 """
 
 from statistics import NormalDist
@@ -15,11 +15,11 @@ from asca_pillars.sim.casting.raycast import Hits
 from asca_pillars.sim.casting.rays import PLAIN, ray_bits
 from asca_pillars.sim.sensor.lidar import Firings
 
-FADING = 0.5  # spread of the power from firing to firing, in logarithm
-PIVOT = 0.4  # the reflectance that the response leaves as it is
-UPDOWN_SPLIT = 0.3  # rings lie farther apart than firings: a footprint leans over fewer of their edges
-EDGE_M = 0.3  # less is a slant, not an edge
-PULSE_M = 0.6  # nearer together, two surfaces make one return
+FADING = 0.5  # spread of the power between firings, in logarithm
+PIVOT = 0.4  # the reflectance that the response does not change
+UPDOWN_SPLIT = 0.3  # rings are farther apart than firings: a footprint straddles fewer of their edges
+EDGE_M = 0.3  # smaller steps are a slant, not an edge
+PULSE_M = 0.6  # nearer surfaces give one return
 BETWEEN_SHARE, BETWEEN_M = 0.1, 5.0  # how often two echoes farther apart than that still do, and up to which distance
 
 _LEVELS = 4096
@@ -29,17 +29,17 @@ _NOISE_SALT, _FATE_SALT = 1, 2
 
 
 class Met(NamedTuple):
-    """First hits of the firings (K,C), as in `Hits`; rho is infinite for nothing."""
+    """First hits of the firings (K,C), as in `Hits`; rho is infinite without a hit."""
 
     rho_m: Floats
     cosine: Singles
     reflectance: Singles
     owner: NDArray[np.int32]
-    hidden: Mask  # firings that report nothing: the ego vehicle blocks them, or nobody asks
+    hidden: Mask  # firings without a report: blocked by the ego vehicle, or not needed
 
 
 class Lasers(NamedTuple):
-    """The lasers (K,) and columns (C,) of a scan, as in `Firings`."""
+    """Lasers (K,) and columns (C,) of a scan, as in `Firings`."""
 
     slope: Floats
     stretch: Floats  # length of a ray per metre of horizontal distance
@@ -57,7 +57,7 @@ class Lasers(NamedTuple):
 
 
 class Receiver(NamedTuple):
-    """Numbers that all lasers share: those of `Lidar`, and those drawn for the scan in `Firings`."""
+    """Parameters of all lasers: those of `Lidar`, and those drawn for the scan in `Firings`."""
 
     lost_power: float
     zero_power: float
@@ -82,7 +82,7 @@ class Echo(NamedTuple):
     slant_m: float
     cosine: float
     reflectance: float
-    share: float  # of the beam's power that met it; 0 for an echo that is lost
+    share: float  # of the beam's power that hit it; 0 for a lost echo
     ring: int
     column: int
 
@@ -101,10 +101,10 @@ def echo_of(
     number: Ints,
     receiver: Receiver,
 ) -> Echo:
-    """The echo of firing (k, j), which may lean over an edge to a neighboring firing's surface.
+    """Return the echo of firing (k, j), which may straddle an edge to a neighboring firing's surface.
 
     rho in metres, cosine and reflectance are (K, C), as in `Met`; stretch, slopes (K,) and number (C,) as in `Lasers`.
-    `lean` in 0..1 says to which neighbor and how far, `fate` in 0..1 what becomes of two echoes: none, one between
+    `lean` in 0..1 selects the neighbor and the part on it, `fate` in 0..1 the result of two echoes: none, one between
     both, or the stronger of them.
     """
     columns, turn = rho.shape[1], receiver.columns_per_turn
@@ -116,7 +116,7 @@ def echo_of(
     column = (j + step + columns) % columns if across else j
     other = rho[row, column] * stretch[row]
     if across and number[column] != (number[j] + step + turn) % turn:
-        other = np.inf  # where the part of the revolution that is fired ends
+        other = np.inf  # at the ends of the cast part of the revolution
     apart = abs(other - slant)
     spacing = 2 * np.pi / turn if across else abs(slopes[row] - slopes[k])
     hit = Echo(slant, cosine[k, j], reflectance[k, j], 1.0, k, j)
@@ -136,7 +136,7 @@ def echo_of(
 
 @cached(inline="always", **PLAIN)
 def fade_of(slant: float, near_fade: float, receiver: Receiver) -> float:
-    """Reported over true reflectance: strongest where the lens is focused."""
+    """Return the ratio of reported to true reflectance: largest where the lens is focused."""
     if receiver.fade_m <= 0.0:
         return 1.0
     if slant > receiver.focus_m:
@@ -146,7 +146,7 @@ def fade_of(slant: float, near_fade: float, receiver: Receiver) -> float:
 
 @cached(**PLAIN)
 def report_firings(met: Met, lasers: Lasers, receiver: Receiver, key: int) -> tuple[Singles, NDArray[np.int32], Ints]:
-    """Points (N, 4) in the LiDAR frame, the indices of their owners (N,) and of their rings (N,), ring by ring."""
+    """Return points (N, 4) in the LiDAR frame, indices of their owners (N,) and rings (N,), ring by ring."""
     rho, cosine, reflectance, owners, hidden = met.rho_m, met.cosine, met.reflectance, met.owner, met.hidden
     slopes, stretch, origins, cos_phase, sin_phase, biases, gains, sigmas, faints, near_fades = lasers[:10]
     cosines, sines, number = lasers[10:]
@@ -164,7 +164,7 @@ def report_firings(met: Met, lasers: Lasers, receiver: Receiver, key: int) -> tu
             echo = echo_of(
                 k, j, _uniform(more, 1), _uniform(more, 2), rho, cosine, reflectance, stretch, slopes, number, receiver
             )
-            # Rough surfaces keep answering at grazing incidence: the root of the cosine, not the cosine.
+            # Rough surfaces return light at grazing incidence, too: the root of the cosine, not the cosine.
             power = echo.reflectance * np.sqrt(echo.cosine) / echo.slant_m**2 * echo.share * _FADED[_level(bits, 1)]
             slant = echo.slant_m + _NORMAL[_level(bits, 0)] * receiver.range_sigma_m + biases[k]
             if not (power > receiver.lost_power and luck >= receiver.loss_share):
@@ -189,13 +189,13 @@ def report_firings(met: Met, lasers: Lasers, receiver: Receiver, key: int) -> tu
 
 @cached(inline="always", **PLAIN)
 def _level(bits: np.uint64, part: int) -> int:
-    """One of _LEVELS, from the quarter `part` of 64 random bits."""
+    """Return one of _LEVELS, from the quarter `part` of 64 random bits."""
     return int((bits >> np.uint64(16 * part)) & np.uint64(_LEVELS - 1))
 
 
 @cached(inline="always", **PLAIN)
 def _uniform(bits: np.uint64, part: int) -> float:
-    """A number in [0, 1), from the quarter `part` of 64 random bits: 16 are fine enough."""
+    """Return a number in [0, 1), from the quarter `part` of 64 random bits: 16 are fine enough."""
     return float((bits >> np.uint64(16 * part)) & np.uint64(65535)) / 65536.0
 
 
@@ -208,7 +208,7 @@ class Returns(NamedTuple):
 
 
 def measure(hits: Hits, firings: Firings, rng: np.random.Generator) -> Returns:
-    """Points of one revolution. A firing's noise depends on its ring and column, not on which others are cast."""
+    """Measure one revolution. A firing's noise depends on its ring and column, not on the other cast ones."""
     lidar = firings.lidar
     near_m, far_m = lidar.range_m
     lasers = Lasers(

@@ -1,1 +1,1 @@
-"""Short drives: the same street scan after scan, with the car and the road users moving."""
+"""Short drives: the same street scan by scan, with moving car and road users."""

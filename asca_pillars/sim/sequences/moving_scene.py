@@ -1,4 +1,4 @@
-"""A street on which the car and the road users move along straight ways at constant speed."""
+"""Street on which the car and the road users move on straight paths at constant speed."""
 
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -14,14 +14,14 @@ from asca_pillars.sim.world.ground import Ground
 from asca_pillars.sim.world.placement import ON_FOOT, Placer, Target
 from asca_pillars.sim.world.scene import KEPT_CLEAR_M, Scene, draw_scene
 
-TRAVEL_M = 60.0  # the car's longest way: the scene's street is 170 m long, and the sensor sees 80 m
-RING_M = 230.0  # traffic that leaves the street at one end comes back, as somebody else, at the other
+TRAVEL_M = 60.0  # the car's longest path: the scene's street is 170 m long, and the sensor's range is 80 m
+RING_M = 230.0  # traffic that leaves the street at one end returns as another object at the other
 LANE_M = 3.0
 # Speeds, metres per second: of traffic by the kind of street, on crossing roads, of riders and walkers.
 FLOW_MPS = {"residential": (4.0, 9.0), "urban": (5.0, 12.0), "rural": (8.0, 18.0), "campus": (3.0, 8.0)}
 CROSSING_MPS, RIDING_MPS, WALKING_MPS = (3.0, 8.0), (2.5, 6.5), (0.8, 1.8)
-STANDING_SHARE = 0.15  # of lanes whose traffic waits, and of walkers and riders
-WALK_M = 25.0  # a walker stops so far from where it was placed
+STANDING_SHARE = 0.15  # of lanes with waiting traffic, and of walkers and riders
+WALK_M = 25.0  # a walker stops at this distance from its initial position
 EGO_M = (4.6, 2.2)  # length and width of the car
 # Margin added to a footprint's length and width within which two of them may not touch.
 APART_M, PEOPLE_APART_M = 0.5, -0.2
@@ -31,14 +31,14 @@ _HELD_M = 12.0
 
 @dataclass(frozen=True)
 class Way:
-    """A straight way through the world.
+    """Straight path through the world.
 
     Attributes:
-        x_m, y_m: where it is in the middle of the sequence, or would be if it had not stopped.
-        heading_rad: where it goes.
-        speed_mps: while it goes.
-        from_m, to_m: it starts and stops so far along its heading from there.
-        ring: it goes round RING_M of the street instead.
+        x_m, y_m: position in the middle of the sequence, or without a stop before.
+        heading_rad: direction of motion.
+        speed_mps: speed while moving.
+        from_m, to_m: start and stop along its heading from there.
+        ring: the path is a loop of RING_M instead.
     """
 
     x_m: float
@@ -50,7 +50,7 @@ class Way:
     ring: bool = False
 
     def at(self, times_s: Floats) -> "Places":
-        """Poses at times (T,), seconds from the middle of the sequence."""
+        """Return poses at times (T,), seconds from the middle of the sequence."""
         gone = np.asarray(times_s, float) * self.speed_mps
         way = np.clip(gone, self.from_m, self.to_m)
         x, y = self.x_m + way * np.cos(self.heading_rad), self.y_m + way * np.sin(self.heading_rad)
@@ -63,20 +63,20 @@ class Way:
 
 
 class Places(NamedTuple):
-    """A way at T moments."""
+    """Positions on a path at T times."""
 
     xy_m: Floats
-    """(T, 2)."""
+    """(T, 2) positions."""
     gone_m: Floats
-    """(T,) along the way, from its middle."""
+    """(T,) distance along the path, from its middle."""
     speed_mps: Floats
-    """(T,) now."""
+    """(T,) current speed."""
     laps: Ints
-    """(T,) how often it has left the street."""
+    """(T,) number of times it has left the street."""
 
 
 class Going(NamedTuple):
-    """An object and its way."""
+    """Object and its path."""
 
     target: Target
     way: Way
@@ -85,16 +85,16 @@ class Going(NamedTuple):
 def draw_ways(
     targets: list[Target], ground: Ground, kind: str, duration_s: float, rng: np.random.Generator
 ) -> tuple[Way, list[Going]]:
-    """The way of the car, and those of the objects that never touch the car or each other.
+    """Return the path of the car, and those of the objects that never touch the car or each other.
 
-    An object whose way is not free stands still; one that is in the way even then is left out.
+    An object whose path is not free does not move; one that is still in the way is left out.
 
     Args:
-        targets: as they were placed.
+        targets: the placed objects.
         ground: a straight street along x.
-        kind: of the street, for the speed of its traffic.
-        duration_s: of the sequence.
-        rng: of the sequence.
+        kind: kind of the street, for the speed of its traffic.
+        duration_s: duration of the sequence.
+        rng: generator of the sequence.
     """
     flow: dict[tuple[int, float], float] = {}
     limit = TRAVEL_M / duration_s
@@ -105,13 +105,13 @@ def draw_ways(
     taken = [_footprints(ego, times, (*EGO_M, 0.0), APART_M)]
     drawn = [_way(target, ground, kind, flow, rng) for target in targets]
     kept: dict[int, Going] = {}
-    # Objects that cannot move come first: they have no other choice.
+    # Objects that cannot move come first: they have no alternative.
     for index in sorted(range(len(targets)), key=lambda index: drawn[index].speed_mps > 0):
         target = targets[index]
         x, y, _, *size, yaw = target.box
         apart = PEOPLE_APART_M if target.type in ON_FOOT else APART_M
         drawn_way = drawn[index]
-        # Traffic does not stop in its lane: what follows would run into it.
+        # Traffic does not stop in its lane: following vehicles would hit it.
         for way in (drawn_way,) if drawn_way.ring else (drawn_way, Way(x, y, yaw)):
             footprints = _footprints(way, times, size, apart)
             if not any(_touch(footprints, other) for other in taken):
@@ -122,7 +122,7 @@ def draw_ways(
 
 
 def held_footprints(way: Way, size: tuple[float, float], duration_s: float) -> list[tuple[float, ...]]:
-    """Footprints x, y, length, width, yaw, metres, that cover all of a way during a sequence."""
+    """Return footprints x, y, length, width, yaw, metres, that cover all of a path during a sequence."""
     length, width = size
     half = way.speed_mps * duration_s / 2
     low, high = max(-half, way.from_m), min(half, way.to_m)
@@ -140,11 +140,11 @@ def held_footprints(way: Way, size: tuple[float, float], duration_s: float) -> l
 def _way(
     target: Target, ground: Ground, kind: str, flow: dict[tuple[int, float], float], rng: np.random.Generator
 ) -> Way:
-    """A way that fits what the object does; the other objects are not looked at."""
+    """Return a path for the object's motion; other objects are not considered."""
     x, y, yaw = float(target.box[0]), float(target.box[1]), float(target.box[6])
     still, waits = Way(x, y, yaw), rng.random() < STANDING_SHARE
     along = 0.0 if np.cos(yaw) > 0 else np.pi
-    aside = y - ground.to_lidar(0.0, 0.0)[1]  # from the middle of the road
+    aside = y - ground.to_lidar(0.0, 0.0)[1]  # distance from the middle of the road
     if target.going == "lane":
         key = (_lane(y, ground), along)
         if key not in flow:
@@ -154,7 +154,7 @@ def _way(
         return still if waits else Way(x, y, yaw, float(rng.uniform(*CROSSING_MPS)))
     edge = max(abs(aside), ground.half_width_m + ground.pavement_m + 0.3)
     if target.going == "riding" and abs(np.sin(yaw)) < 0.5:
-        # Along the street all of it has to be free, so that riders keep to the pavement.
+        # All of the path along the street has to be free, so that riders keep to the pavement.
         side = float(np.sign(aside)) * min(abs(aside), ground.half_width_m + max(ground.pavement_m, 1.0))
         return still if waits else Way(x, y - aside + side, along, float(rng.uniform(*RIDING_MPS)), ring=True)
     if target.going in ("riding", "walking") and not waits:
@@ -170,7 +170,7 @@ def _lane(y_m: float, ground: Ground) -> int:
 
 
 def _footprints(way: Way, times_s: Floats, size: ArrayLike, apart_m: float) -> Floats:
-    """(T, 7) boxes, of which only what is seen from above counts."""
+    """Return (T, 7) boxes, of which only the footprints are used."""
     boxes = np.zeros((len(times_s), 7))
     boxes[:, :2] = way.at(times_s).xy_m
     boxes[:, 3:6] = size
@@ -184,12 +184,12 @@ def _touch(a: Floats, b: Floats) -> bool:
     return bool(close.any() and paired_bev_touch(a[close], b[close]).any())
 
 
-FAR_M = 115.0  # beyond it an object is out of every sensor's reach
-MAX_RELIEF_M = 0.5  # the car does not pitch, so that its street has to be level
+FAR_M = 115.0  # beyond every sensor's range
+MAX_RELIEF_M = 0.5  # the car does not pitch, so its street has to be level
 
 
 class Moment(NamedTuple):
-    """The street as the sensor finds it at one moment, in the LiDAR frame of that moment."""
+    """Street at one time, in the LiDAR frame of that time."""
 
     scene: Scene
     track_ids: tuple[int, ...]
@@ -202,7 +202,7 @@ class Moment(NamedTuple):
 
 @dataclass(frozen=True)
 class MovingScene:
-    """The street in the middle of the sequence, with the ways of the car and of each of its targets."""
+    """Street in the middle of the sequence, with the paths of the car and of each of its targets."""
 
     scene: Scene
     ego: Way
@@ -210,12 +210,12 @@ class MovingScene:
     duration_s: float
 
     def at(self, time_s: float) -> Moment:
-        """The street `time_s` after the sequence's start."""
+        """Return the street `time_s` after the sequence's start."""
         times = np.array([time_s - self.duration_s / 2])
         driven = float(self.ego.at(times).xy_m[0, 0])
         ground = self.scene.ground
         here, there = ground.heights([(0.0, 0.0), (driven, 0.0)])
-        lifted = float(there - here)  # the sensor is as high above the street as it was
+        lifted = float(there - here)  # the sensor's height above the street is constant
         street = ground.street._replace(along_m=driven, cross_u_m=ground.street.cross_u_m - driven)
         targets, ids, velocities = [], [], []
         for index, (target, way) in enumerate(zip(self.scene.targets, self.ways, strict=True)):
@@ -244,9 +244,9 @@ class MovingScene:
 def draw_moving_scene(
     config: SceneConfig, rng: np.random.Generator, rng_of_ways: np.random.Generator, duration_s: float
 ) -> MovingScene:
-    """A random street and what goes on in it for `duration_s`.
+    """Draw a random street and the motion on it for `duration_s`.
 
-    It is straight, level and never empty, and the car keeps its lane: `config` has no say in that.
+    It is straight, level and never empty, and the car keeps its lane, whatever `config` states.
     """
     straight = replace(
         config,
@@ -278,5 +278,5 @@ def _size(target: Target) -> tuple[float, float]:
 
 
 def _unsigned(lap: int) -> int:
-    """0, 1, 2, 3, 4 for 0, -1, 1, -2, 2: laps as numbers that can be part of an identity."""
+    """Map laps 0, -1, 1, -2, 2 to 0, 1, 2, 3, 4, which can be part of an identity."""
     return 2 * lap if lap >= 0 else -2 * lap - 1

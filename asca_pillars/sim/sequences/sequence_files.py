@@ -2,11 +2,11 @@
 
 Below the dataset's root:
 
-    dataset.yaml                    where the rest is
+    dataset.yaml                    paths of the rest
     scans/0002/000031.bin           scan 31 of sequence 2
     labels/0002/000031.json         its boxes, time and pose: see `frame_labels`
     ImageSets/train.txt, val.txt    whole sequences each
-    simulation.json                 what they depend on
+    simulation.json                 the settings of the simulation
 """
 
 from dataclasses import asdict, dataclass, replace
@@ -43,13 +43,13 @@ from asca_pillars.sim.world.streets import draws_of
 RATE_HZ = 10.0
 _DATASET = yaml.safe_dump({"labels": "labels", "columns": 4, "reflectance_scale": 1.0})
 PAUSE_S = 5.0  # from the last scan of a sequence to the first of the next, in the time stamps
-# Random streams of a sequence, beside those of single frames.
+# Random streams of a sequence, different from those of single frames.
 _SCENE, _WAYS, _SENSOR, _BODIES, _NOISE = 10, 11, 12, 13, 14
 
 
 @dataclass(frozen=True)
 class SequencePlan:
-    """Everything that a scan of a sequence depends on, but for its number: what simulation.json says."""
+    """Everything that a scan of a sequence depends on, except its number, as in simulation.json."""
 
     seed: int
     length: int
@@ -61,20 +61,20 @@ class SequencePlan:
         return self.length / RATE_HZ
 
     def time_s(self, sequence: int, index: int) -> float:
-        """Time stamp of a scan: sequences follow each other with pauses."""
+        """Return the time stamp of a scan: sequences follow each other with pauses."""
         return round(sequence * (self.duration_s + PAUSE_S) + index / RATE_HZ, 6)
 
 
 @dataclass(frozen=True)
 class SequenceFrame:
-    """One scan of a sequence: points (N, 4) float32 x, y, z metres in the LiDAR frame and reflectance, and labels."""
+    """Scan of a sequence: points (N, 4) float32 x, y, z metres in the LiDAR frame and reflectance, and labels."""
 
     points: npt.NDArray[np.float32]
     labels: dict[str, Any]
 
 
 def simulate_sequence_frame(plan: SequencePlan, sequence: int, index: int) -> SequenceFrame:
-    """Scan `index` of a sequence: the same for every call, whatever other scans are made."""
+    """Simulate scan `index` of a sequence: the same for every call, whatever other scans are simulated."""
     config = plan.config
     world, firings = _world(plan, sequence)
     moment = world.at(index / RATE_HZ)
@@ -94,11 +94,11 @@ def simulate_sequence_frame(plan: SequencePlan, sequence: int, index: int) -> Se
 
 
 def frame_labels(moment: Moment, time_s: float, points: list[int], occluded: list[int]) -> dict[str, Any]:
-    """The labels of a scan as plain values: `time_s`, `ego_pose` and `boxes` of all that returns a point.
+    """Return the labels of a scan as plain values: `time_s`, `ego_pose` and `boxes` of all objects with a return.
 
     A box is a record of `data.boxes.box_records`, LiDAR frame, with `track_id`, `vx_mps` and `vy_mps` (over ground,
     along the frame's axes), `points` and `occluded` (0 to 3, as KITTI's). `ego_pose` is the 4x4 matrix from the LiDAR
-    frame to one that stands still during the sequence, metres.
+    frame to a fixed frame of the sequence, metres.
     """
     boxes = []
     for row in nearest_first(moment.scene.targets).tolist():
@@ -126,8 +126,8 @@ def simulate_sequences(
 ) -> Path:
     """Write `sequences` sequences of `length` scans each, at 10 Hz, below `out`; returns `out`.
 
-    Any number of workers writes the same bytes, and a run that was interrupted, or asked for fewer sequences, goes on
-    where it stopped. Everything around the car is labelled; a field of view "camera" keeps what the camera sees.
+    The result does not depend on the number of workers, and a run that was interrupted, or had fewer sequences, is
+    resumed. Everything around the car is labelled; a field of view "camera" keeps the camera's view.
 
     Raises:
         ConfigError: a number below 1, or a share outside 0..1.
@@ -151,7 +151,7 @@ def simulate_sequences(
 
 
 def require_own_sequences(out: Path) -> None:
-    """Make sure that `simulate_sequences` may write into `out`; OutputError names what is not ours to replace."""
+    """Make sure that `simulate_sequences` may write into `out`; OutputError names foreign files."""
     folders = [folder.relative_to(out) for name in ("scans", "labels") for folder in (out / name).glob("*/")]
     about_keys = ("seed", "length", "rate_hz", "scene", "lidar", "field_of_view")
     require_own_simulation(out, about_keys, ("scans", "labels", *folders))
@@ -160,14 +160,14 @@ def require_own_sequences(out: Path) -> None:
 
 @lru_cache(maxsize=1)
 def _world(plan: SequencePlan, sequence: int) -> tuple[MovingScene, Firings]:
-    """World of one sequence after the other: a process draws a street once, not for each of its scans."""
+    """Return the world of a sequence, cached: a process draws a street once, not for each of its scans."""
     scene, ways, sensor = (draws_of(plan.seed, sequence, stream) for stream in (_SCENE, _WAYS, _SENSOR))
     firings = draw_firings(plan.config.lidar, sensor, plan.config.field_of_view == "camera", True)
     return draw_moving_scene(plan.config.scene, scene, ways, plan.duration_s), firings
 
 
 def _rounded(value: float) -> float:
-    return round(float(value), 4) + 0.0  # no minus before a zero
+    return round(float(value), 4) + 0.0  # avoids -0
 
 
 def _scan_path(root: Path, sequence: int, index: int) -> Path:
@@ -179,4 +179,4 @@ def _write_frame(root: Path, plan: SequencePlan, item: tuple[int, int]) -> None:
     frame = simulate_sequence_frame(plan, sequence, index)
     labels = root / "labels" / f"{sequence:04d}" / f"{index:06d}.json"
     write_once(labels, lambda path: write_json(path, frame.labels))
-    write_scan(_scan_path(root, sequence, index), frame.points)  # last: where it is, the frame is complete
+    write_scan(_scan_path(root, sequence, index), frame.points)  # last: its existence shows that the frame is complete

@@ -1,4 +1,4 @@
-"""Collecting the unlabelled bodies of a street as rows of simple shapes, and setting them on the ground at once."""
+"""Collection of the unlabelled bodies of a street as rows of primitives, placed on the ground at once."""
 
 from dataclasses import dataclass, field
 
@@ -12,12 +12,12 @@ from asca_pillars.sim.world.ground import Ground
 from asca_pillars.sim.world.placement import Occupied
 
 Material = tuple[float, float, float]  # reflectance, gloss, transparency
-HEAD_ROOM_M = 2.2  # leaves above may hang over objects
+HEAD_ROOM_M = 2.2  # leaves above this height may be over objects
 
 
 @dataclass(frozen=True)
 class Stretch:
-    """A piece of one side of a road: from `start_m` on for `length_m` along it, `away_m` from its middle.
+    """Section of one side of a road: from `start_m` on for `length_m` along it, `away_m` from its middle.
 
     `side` is 1 left of the road and -1 right of it; `cross` means the crossing road.
     """
@@ -30,19 +30,19 @@ class Stretch:
 
     @property
     def middle_m(self) -> float:
-        """Its middle along the road."""
+        """Position of its middle along the road."""
         return self.start_m + self.length_m / 2
 
     def along(self, step_m: float) -> Floats:
-        """Middles (N,) of as many pieces of `step_m` as fit, metres."""
+        """Return the middles (N,) of as many pieces of `step_m` as fit, metres."""
         return np.asarray(np.arange(self.start_m + step_m / 2, self.start_m + self.length_m - 0.45 * step_m, step_m))
 
 
 @dataclass
 class Builder:
-    """Bodies so far.
+    """Bodies collected so far.
 
-    Until `primitives` sets them on the ground all at once, rows are in road coordinates, with heights above the local
+    Until `primitives` places them on the ground all at once, rows are in road coordinates, with heights above the local
     ground, and end with 1 beside the crossing road, 0 beside the main one.
     """
 
@@ -61,17 +61,17 @@ class Builder:
         self._kept_clear = self.occupied.rows[: self.occupied.count].copy()
 
     def to_lidar(self, along: float, across: float, cross: bool = False) -> tuple[float, float, float]:
-        """A place beside the main or the crossing road as x, y and the road's heading."""
+        """Return a position beside the main or the crossing road as x, y and the road's heading."""
         return (self.ground.cross_to_lidar if cross else self.ground.to_lidar)(along, across)
 
     def near_junction(self, start_m: float, end_m: float) -> bool:
-        """Whether a piece of the main road's side would stand on the crossing road."""
+        """Return whether a section of the main road's side would be on the crossing road."""
         reach = self.ground.cross_half_m + self.ground.pavement_m + 1.0
         middle = self.ground.cross_u_m
         return self.ground.cross_half_m > 0 and start_m < middle + reach and end_m > middle - reach
 
     def until_junction(self, start_m: float, length_m: float) -> float:
-        """Length of the part of a piece of the main road's side before the crossing road."""
+        """Return the length of the part of a section of the main road's side before the crossing road."""
         first = self.ground.cross_u_m - self.ground.cross_half_m - self.ground.pavement_m - 1.0
         return first - start_m if self.ground.cross_half_m > 0 and start_m < first < start_m + length_m else length_m
 
@@ -81,7 +81,7 @@ class Builder:
         return self.occupied.take(x, y, length, width, yaw)
 
     def body(self, body: Primitives, along: float, across: float, yaw: float) -> None:
-        """Any body, at a place beside the main road and turned against it."""
+        """Add any body, at a position beside the main road and rotated relative to it."""
         x, y, heading = self.to_lidar(along, across)
         z = float(self.ground.heights((x, y))[0])
         self._bodies.append(body.placed(x, y, z, heading + yaw))
@@ -96,7 +96,7 @@ class Builder:
         cross: bool = False,
         yaw: float = 0.0,
     ) -> None:
-        """A box of `size` (along, across, up) whose bottom is z above the ground."""
+        """Add a box of `size` (along, across, up) whose bottom is z above the ground."""
         self._boxes.append((along, across, z, *size, yaw, *material, cross))
 
     def post(
@@ -112,7 +112,7 @@ class Builder:
         taper: float = 1.0,
         lean: tuple[float, float] = (0.0, 0.0),
     ) -> None:
-        """A round post whose radius at the top is `taper` times that at the foot.
+        """Add a round post whose radius at the top is `taper` times that at the foot.
 
         It leans by `lean` metres per metre of height along x and y.
         """
@@ -121,7 +121,7 @@ class Builder:
     def ball(
         self, along: float, across: float, z: float, radii: tuple[float, float, float], reflectance: float
     ) -> None:
-        """A solid ellipsoid around z above the ground."""
+        """Add a solid ellipsoid around z above the ground."""
         _, _, yaw = self.to_lidar(along, across)
         self._blobs.append(np.array([[along, across, z, *radii, yaw, reflectance, 0.0, 0.0]]))
 
@@ -137,9 +137,9 @@ class Builder:
         *,
         turned: bool = True,
     ) -> None:
-        """N clouds of leaves: ellipsoids of radii (N, 3), metres, around z (N,) above the ground.
+        """Add n clouds of leaves: ellipsoids of radii (N, 3), metres, around z (N,) above the ground.
 
-        Each is turned at random or, for hedges, along the road.
+        Each is rotated at random or, for hedges, along the road.
         """
         rows = np.empty((len(along), 10))
         rows[:, 0], rows[:, 1], rows[:, 2], rows[:, 3:6] = along, across, z, radii
@@ -151,7 +151,7 @@ class Builder:
         self._blobs.append(rows)
 
     def primitives(self) -> Primitives:
-        """All bodies, set on the ground."""
+        """Return all bodies, placed on the ground."""
         parts = list(self._bodies)
         if self._boxes:
             rows = np.array(self._boxes)
@@ -179,7 +179,7 @@ class Builder:
 
 @cached()
 def _intrudes(blobs: Floats, footprints: Floats) -> Mask:
-    """Mask of the clouds that would hang into the car (its sensor would see nothing else) or an object."""
+    """Return the mask of the clouds that would be in the car (blocking its sensor) or an object."""
     result = np.zeros(len(blobs), np.bool_)
     for i in range(len(blobs)):
         if blobs[i, 2] - blobs[i, 5] >= HEAD_ROOM_M:

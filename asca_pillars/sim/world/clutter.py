@@ -1,4 +1,4 @@
-"""Things on pavements, verges and in yards, many as large as a person or a car; some hide labelled objects."""
+"""Objects on pavements, verges and in yards, many as large as a person or a car; some occlude labelled objects."""
 
 import math
 from bisect import bisect_left
@@ -52,7 +52,7 @@ from asca_pillars.sim.world.vegetation import bush, hedge_block, shrub, tree, we
 
 
 def thin_cylinder(builder: Builder, along: float, across: float) -> None:
-    """A round thing as tall as a person: a stump, a pipe, a rolled carpet, a wrapped tree."""
+    """Add a round object as tall as a person: a stump, a pipe, a rolled carpet, a wrapped tree."""
     rng = builder.rng
     radius = float(rng.uniform(0.08, 0.28))
     if builder.reserve(along, across, 2 * radius, 2 * radius):
@@ -70,7 +70,7 @@ def thin_cylinder(builder: Builder, along: float, across: float) -> None:
 
 
 def post_with_box(builder: Builder, along: float, across: float) -> None:
-    """A parking meter, a letter box, a counter, a pump, a bird house: something wide on something thin."""
+    """Add a parking meter, letter box, counter, pump or bird house: something wide on something thin."""
     rng = builder.rng
     size = (float(rng.uniform(0.15, 0.5)), float(rng.uniform(0.2, 0.6)), float(rng.uniform(0.25, 0.9)))
     if builder.reserve(along, across, 0.5, 0.5):
@@ -80,7 +80,7 @@ def post_with_box(builder: Builder, along: float, across: float) -> None:
 
 
 def column(builder: Builder, along: float, across: float) -> None:
-    """An upright slab or pillar: a stone, a gate's pillar, an advertising stele, a stack of chairs."""
+    """Add an upright slab or pillar: a stone, a gate's pillar, an advertising stele, a stack of chairs."""
     rng = builder.rng
     size = (float(rng.uniform(0.2, 0.7)), float(rng.uniform(0.15, 0.7)), float(rng.uniform(1.0, 2.4)))
     if builder.reserve(along, across, 0.8, 0.8):
@@ -90,7 +90,7 @@ def column(builder: Builder, along: float, across: float) -> None:
 
 
 def container(builder: Builder, along: float, across: float) -> None:
-    """A skip, a container for glass or clothes, a building site's box, a small transformer house."""
+    """Add a skip, a container for glass or clothes, a building site's box, a small transformer house."""
     rng = builder.rng
     length, width = float(rng.uniform(1.2, 6.0)), float(rng.uniform(1.0, 2.4))
     height = float(rng.uniform(0.9, 2.7))
@@ -99,14 +99,14 @@ def container(builder: Builder, along: float, across: float) -> None:
     paint = material(builder)
     if rng.random() < 0.5:
         builder.box(along, across, -0.1, (length, width, height + 0.1), paint)
-    else:  # an open skip, whose ends slope outward: a smaller foot below a larger rim
+    else:  # an open skip, whose ends slope outward: a smaller base below a larger rim
         builder.box(along, across, -0.1, (0.65 * length, 0.9 * width, height + 0.1), paint)
         builder.box(along, across, 0.45 * height, (0.85 * length, 0.95 * width, 0.3 * height), paint)
         builder.box(along, across, 0.72 * height, (length, width, 0.28 * height), paint)
 
 
 def heap(builder: Builder, along: float, across: float) -> None:
-    """Earth, gravel, leaves, boulders, bags: low round mounds."""
+    """Add earth, gravel, leaves, boulders or bags: low round mounds."""
     rng = builder.rng
     wide = float(np.exp(rng.uniform(np.log(0.2), np.log(2.4))))
     if not builder.reserve(along, across, 1.6 * wide, 1.2 * wide):
@@ -119,7 +119,7 @@ def heap(builder: Builder, along: float, across: float) -> None:
 
 
 def stack(builder: Builder, along: float, across: float) -> None:
-    """Pallets, timber, bricks, boxes: uneven blocks on and beside each other."""
+    """Add pallets, timber, bricks or boxes: uneven blocks on and beside each other."""
     rng = builder.rng
     length, width, height = float(rng.uniform(0.6, 4.5)), float(rng.uniform(0.5, 1.8)), float(rng.uniform(0.5, 1.9))
     if not builder.reserve(along, across, length, width):
@@ -137,13 +137,13 @@ def stack(builder: Builder, along: float, across: float) -> None:
 
 
 def parked_bicycles(builder: Builder, along: float, across: float) -> None:
-    """Bicycles without riders, which KITTI does not label: a few, or a rack full of them."""
+    """Add bicycles without riders, which KITTI does not label: a few, or a full rack."""
     rng = builder.rng
     leaning = np.pi / 2 if rng.random() < 0.6 else 0.0
     number = int(rng.integers(4, 12)) if leaning and rng.random() < 0.4 else int(rng.integers(1, 5))
     step = float(rng.uniform(0.45, 0.8)) if leaning else 2.0
     length, width = (0.4, 1.75) if leaning else (1.75, 0.55)
-    bodies = [parked_bicycle_body(rng) for _ in range(min(number, 2))]  # racks repeat them: they are dear to draw
+    bodies = [parked_bicycle_body(rng) for _ in range(min(number, 2))]  # racks repeat them: drawing is slow
     for i in range(number):
         place = along + i * step
         if builder.reserve(place, across, length, width):
@@ -151,7 +151,7 @@ def parked_bicycles(builder: Builder, along: float, across: float) -> None:
 
 
 def parked_motorbikes(builder: Builder, along: float, across: float) -> None:
-    """One to four motorcycles side by side."""
+    """Add one to four motorcycles side by side."""
     rng = builder.rng
     turned = float(rng.choice([0.0, 0.9, np.pi / 2]))
     length, width = (2.0, 0.8) if turned == 0.0 else (0.9, 2.1)
@@ -165,7 +165,7 @@ SCATTERED_WITHIN_M = 38.0  # of the road's middle
 
 
 def scatter(builder: Builder) -> None:
-    """Clutter along both sides of the main road, most of it right behind the kerb, some of it far from any road."""
+    """Add clutter along both sides of the main road, mostly right behind the kerb, some far from any road."""
     rng, ground = builder.rng, builder.ground
     pavement = ground.pavement_m
     things, weights = zip(*SHARES.items(), strict=True)
@@ -193,7 +193,7 @@ def scatter(builder: Builder) -> None:
 
 
 def any_shrub(builder: Builder, along: float, across: float) -> None:
-    """Low or tall."""
+    """Add a low or tall shrub."""
     shrub(builder, along, across, tall=bool(builder.rng.random() < 0.35))
 
 

@@ -7,12 +7,12 @@ from asca_pillars.sim.world.vegetation import crown
 
 
 def material(builder: Builder) -> Material:
-    """Any painted, galvanized or bare surface."""
+    """Return any painted, galvanized or bare surface."""
     return (float(builder.rng.uniform(0.06, 0.6)), 0.4, 0.0)
 
 
 def pole(builder: Builder, along: float, across: float) -> None:
-    """A lamp, a sign, a traffic light, a mast."""
+    """Add a lamp, a sign, a traffic light, a mast."""
     rng = builder.rng
     mast = rng.random() < 0.15
     radius = float(rng.uniform(0.12, 0.3) if mast else rng.uniform(0.03, 0.12))
@@ -30,12 +30,12 @@ def pole(builder: Builder, along: float, across: float) -> None:
         lean=(float(tilt[0]), float(tilt[1])),
     )
     what = rng.random()
-    if what < 0.35:  # signs send back nearly everything; from the side they are a line
+    if what < 0.35:  # signs are retroreflective; from the side they are a line
         size = float(rng.uniform(0.35, 0.95))
         yaw = float(rng.choice([0.0, 0.0, 1.57]) + rng.normal(0, 0.3))
         for z in (rng.uniform(1.2, 2.6),) if rng.random() < 0.75 else (1.5, 2.3):
             builder.box(along, across, float(z), (0.04, size, size), (float(rng.uniform(0.4, 0.9)), 0.4, 0.0), yaw=yaw)
-    elif what < 0.5:  # traffic lights, one for drivers and one for people on foot
+    elif what < 0.5:  # traffic lights, one for drivers and one for pedestrians
         for z in (2.1, float(rng.uniform(1.2, 1.6))):
             builder.box(along, across, z, (0.25, 0.3, 0.8), (0.12, 0.4, 0.0), yaw=float(rng.normal(0, 0.5)))
     elif what < 0.65:  # a base with the fuses
@@ -47,7 +47,7 @@ def pole(builder: Builder, along: float, across: float) -> None:
 
 
 def wrapped(builder: Builder, along: float, across: float, wide_m: float, tall_m: float) -> None:
-    """Something uneven and upright under a sheet or wound with plants, `wide_m` in radius."""
+    """Add an uneven upright object under a sheet or covered with plants, `wide_m` in radius."""
     rng = builder.rng
     pieces, reflectance = int(rng.integers(3, 7)), float(rng.uniform(0.12, 0.6))
     for i in range(pieces):
@@ -58,7 +58,7 @@ def wrapped(builder: Builder, along: float, across: float, wide_m: float, tall_m
 
 
 def pole_group(builder: Builder, along: float, across: float) -> None:
-    """Two to five posts close together, as at crossings: from afar as wide as a person."""
+    """Add two to five posts close together, as at crossings: from afar as wide as a person."""
     rng = builder.rng
     for _ in range(int(rng.integers(2, 6))):
         at, beside = along + float(rng.normal(0, 0.35)), across + float(rng.normal(0, 0.35))
@@ -68,7 +68,7 @@ def pole_group(builder: Builder, along: float, across: float) -> None:
 
 
 def bollards(builder: Builder, along: float, across: float) -> None:
-    """A row of short posts."""
+    """Add a row of short posts."""
     rng = builder.rng
     radius, height = float(rng.uniform(0.03, 0.18)), float(rng.uniform(0.4, 1.3))
     reflectance, step = float(rng.uniform(0.1, 0.6)), float(rng.uniform(1.0, 2.5))
@@ -78,7 +78,7 @@ def bollards(builder: Builder, along: float, across: float) -> None:
 
 
 def delineators(builder: Builder, along: float, across: float) -> None:
-    """White posts with reflectors, or cones, in a row along the road."""
+    """Add white posts with reflectors, or cones, in a row along the road."""
     rng = builder.rng
     cone = rng.random() < 0.4
     step = float(rng.uniform(2.0, 5.0) if cone else rng.uniform(12.0, 25.0))
@@ -93,7 +93,7 @@ def delineators(builder: Builder, along: float, across: float) -> None:
 
 
 def cabinet(builder: Builder, along: float, across: float) -> None:
-    """A switch cabinet, a post box, a hydrant's hood, a grit box, several side by side."""
+    """Add a switch cabinet, a post box, a hydrant's hood, a grit box, several side by side."""
     rng = builder.rng
     size = (float(rng.uniform(0.25, 1.6)), float(rng.uniform(0.2, 0.7)), float(rng.uniform(0.6, 2.0)))
     yaw = float(rng.choice([0.0, 1.57]) + rng.normal(0, 0.1))
@@ -105,7 +105,7 @@ def cabinet(builder: Builder, along: float, across: float) -> None:
 
 
 def bins(builder: Builder, along: float, across: float) -> None:
-    """Wheeled bins in a row, small ones or those for many households."""
+    """Add wheeled bins in a row, small or large ones."""
     rng = builder.rng
     size = (1.3, 0.95, 1.35) if rng.random() < 0.25 else (0.52, 0.6, 1.05)
     for i in range(int(rng.integers(1, 7))):
@@ -117,7 +117,7 @@ def bins(builder: Builder, along: float, across: float) -> None:
 
 
 def bench(builder: Builder, along: float, across: float) -> None:
-    """A bench, or two with a table between."""
+    """Add a bench, or two with a table between."""
     rng = builder.rng
     table = rng.random() < 0.3
     if not builder.reserve(along, across, 1.8, 1.7 if table else 0.7):
@@ -134,7 +134,7 @@ def bench(builder: Builder, along: float, across: float) -> None:
 
 
 def planter(builder: Builder, along: float, across: float) -> None:
-    """A tub with something green in it."""
+    """Add a tub with a plant in it."""
     rng = builder.rng
     size = (float(rng.uniform(0.5, 2.0)), float(rng.uniform(0.5, 1.0)), float(rng.uniform(0.3, 0.8)))
     if builder.reserve(along, across, *size[:2]):
@@ -144,7 +144,7 @@ def planter(builder: Builder, along: float, across: float) -> None:
 
 
 def shelter(builder: Builder, along: float, across: float) -> None:
-    """A roof on posts with glass behind, at a stop; or a kiosk, or a telephone box."""
+    """Add a roof on posts with glass behind, at a stop; or a kiosk, or a telephone box."""
     rng = builder.rng
     booth = rng.random() < 0.4
     size = (0.9, 0.9, 2.3) if booth else (float(rng.uniform(2.5, 5.0)), 1.5, 2.5)
@@ -164,7 +164,7 @@ def shelter(builder: Builder, along: float, across: float) -> None:
 
 
 def billboard(builder: Builder, along: float, across: float) -> None:
-    """A board on legs, a board on the ground, a round pillar for posters."""
+    """Add a board on legs, a board on the ground, a round pillar for posters."""
     rng = builder.rng
     if rng.random() < 0.25:
         radius = float(rng.uniform(0.45, 0.75))
@@ -180,7 +180,7 @@ def billboard(builder: Builder, along: float, across: float) -> None:
 
 
 def barrier_boards(builder: Builder, along: float, across: float) -> None:
-    """Red and white boards or mesh on feet around works, with a heap inside."""
+    """Add red and white boards or mesh on feet around works, with a heap inside."""
     rng = builder.rng
     mesh = rng.random() < 0.4
     step, height = (3.4, 2.0) if mesh else (float(rng.uniform(1.2, 2.2)), 1.0)
@@ -195,7 +195,7 @@ def barrier_boards(builder: Builder, along: float, across: float) -> None:
 
 
 def low_stones(builder: Builder, along: float, across: float) -> None:
-    """Kerb stones, wheel stops, steps, speed cushions: short bars low over the ground."""
+    """Add kerb stones, wheel stops, steps or speed cushions: short low bars."""
     rng = builder.rng
     length, yaw = float(rng.uniform(0.8, 3.0)), float(rng.choice([0.0, 1.57]) + rng.normal(0, 0.1))
     height, step = float(rng.uniform(0.06, 0.35)), length + float(rng.uniform(0.0, 0.8))
@@ -213,7 +213,7 @@ def low_stones(builder: Builder, along: float, across: float) -> None:
 
 
 def island(builder: Builder, along: float, across: float) -> None:
-    """A traffic island with its posts and signs, in the middle of the road before a junction."""
+    """Add a traffic island with its posts and signs, in the middle of the road before a junction."""
     rng = builder.rng
     length, width = float(rng.uniform(2.0, 6.0)), float(rng.uniform(0.8, 1.8))
     if not builder.reserve(along, across, length, width):
@@ -227,12 +227,12 @@ def island(builder: Builder, along: float, across: float) -> None:
 
 
 def retroreflective(builder: Builder) -> Material:
-    """Foil that sends light back to where it came from: the sensor reports 0.6 to 0.99, far away too."""
+    """Return retroreflective foil: the sensor reports 0.6 to 0.99, also at large distances."""
     return (float(np.exp(builder.rng.uniform(np.log(0.8), np.log(5.0)))), 0.3, 0.0)
 
 
 def beacon(builder: Builder, along: float, across: float) -> None:
-    """Guidance beacons on feet, in a row or alone: a board as wide as a leg, as tall as a child."""
+    """Add guidance beacons on feet, in a row or alone: a board as wide as a leg, as tall as a child."""
     rng = builder.rng
     size = (0.06, float(rng.uniform(0.2, 0.35)), float(rng.uniform(0.7, 1.15)))
     foil, step = retroreflective(builder), float(rng.uniform(2.5, 8.0))
@@ -248,7 +248,7 @@ def beacon(builder: Builder, along: float, across: float) -> None:
 
 
 def striped_post(builder: Builder, along: float, across: float) -> None:
-    """A round or square post in bands, every other one of foil, with a cap, a sign or nothing on it."""
+    """Add a round or square post with bands, every other one of foil, with a cap, a sign or nothing on it."""
     rng = builder.rng
     wide, tall = float(rng.uniform(0.12, 0.35)), float(rng.uniform(0.8, 1.5))
     if not builder.reserve(along, across, wide, wide):
@@ -269,7 +269,7 @@ def striped_post(builder: Builder, along: float, across: float) -> None:
 
 
 def board(builder: Builder, along: float, across: float) -> None:
-    """A narrow upright board near the ground: a striped plate, an arrow, a poster, some of them retroreflective."""
+    """Add a narrow upright board near the ground: a striped plate, an arrow, a poster, some of them retroreflective."""
     rng = builder.rng
     size = (0.05, float(rng.uniform(0.2, 0.55)), float(rng.uniform(0.8, 1.5)))
     if not builder.reserve(along, across, size[1], size[1]):
@@ -282,7 +282,7 @@ def board(builder: Builder, along: float, across: float) -> None:
 
 
 def leaning_board(builder: Builder, along: float, across: float) -> None:
-    """A board, a plank or a sheet that leans on a post: stacked slices, each a little farther from the foot."""
+    """Add a board, plank or sheet leaning on a post: stacked slices, each farther from the foot."""
     rng = builder.rng
     wide, tall = float(rng.uniform(0.25, 0.7)), float(rng.uniform(0.9, 1.8))
     if not builder.reserve(along, across, 0.8, 0.8):
@@ -295,7 +295,7 @@ def leaning_board(builder: Builder, along: float, across: float) -> None:
 
 
 def mast(builder: Builder, along: float, across: float) -> None:
-    """A mast, thin or thick, with boxes as high as a person, bands of tape, notices and a foot wider than itself."""
+    """Add a mast, thin or thick, with boxes as high as a person, bands of tape, notices and a wider foot."""
     rng = builder.rng
     radius = float(rng.uniform(0.03, 0.09) if rng.random() < 0.6 else rng.uniform(0.09, 0.28))
     if not builder.reserve(along, across, 0.6, 0.6):
@@ -316,9 +316,9 @@ def mast(builder: Builder, along: float, across: float) -> None:
 
 
 def covered_thing(builder: Builder, along: float, across: float) -> None:
-    """Something under a sheet, in a sack or wound with plants: a pump, a statue, stacked chairs, a parasol.
+    """Add an object under a sheet, in a sack or covered with plants: a pump, a statue, stacked chairs, a parasol.
 
-    Some of it is tied to a pole.
+    Some are tied to a pole.
     """
     rng = builder.rng
     wide, tall = float(rng.uniform(0.14, 0.34)), float(rng.uniform(0.9, 1.9))
@@ -331,7 +331,7 @@ def covered_thing(builder: Builder, along: float, across: float) -> None:
 
 
 def wall_end(builder: Builder, along: float, across: float) -> None:
-    """End of a wall: a stub, a pillar before it, a gap."""
+    """Add end of a wall: a stub, a pillar before it, a gap."""
     rng = builder.rng
     length, thick, tall = float(rng.uniform(0.3, 1.6)), float(rng.uniform(0.15, 0.4)), float(rng.uniform(0.7, 2.2))
     if builder.reserve(along, across, length, length):
@@ -350,7 +350,7 @@ def wall_end(builder: Builder, along: float, across: float) -> None:
 
 
 def fragments(builder: Builder, along: float, across: float) -> None:
-    """Some uneven pieces close together, of which a distant sensor catches a few returns each."""
+    """Add some uneven pieces close together, with a few returns each for a distant sensor."""
     rng = builder.rng
     tall = float(rng.uniform(0.3, 1.9))
     for _ in range(int(rng.integers(1, 4))):
@@ -362,7 +362,7 @@ def fragments(builder: Builder, along: float, across: float) -> None:
 
 
 def low_pieces(builder: Builder, along: float, across: float) -> None:
-    """Things hardly higher than a kerb, thinly strewn."""
+    """Add sparse objects hardly higher than a kerb."""
     rng = builder.rng
     for _ in range(int(rng.integers(1, 6))):
         at, beside = along + float(rng.normal(0, 1.5)), across + float(rng.normal(0, 1.0))

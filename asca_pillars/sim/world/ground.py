@@ -1,7 +1,7 @@
-"""The ground: a carriageway with kerbs, a second one that crosses it, verges, banks, hills and tracks.
+"""Ground: a carriageway with kerbs, a crossing one, verges, banks, hills and tracks.
 
-Road coordinates: u along the main road, v to its left, v = 0 at its middle, in metres. They are turned and bent
-against the LiDAR frame, in which the car stands at the origin.
+Road coordinates: u along the main road, v to its left, v = 0 at its middle, in metres. They are rotated and bent
+relative to the LiDAR frame, in which the car is at the origin.
 """
 
 import math
@@ -16,8 +16,8 @@ from asca_pillars.sim.casting import groundcast
 from asca_pillars.sim.casting.groundcast import NO_RAILS, RELIEF_HALF_M, RELIEF_STEP_M, Street
 
 LEVEL_WITHIN_M, SLOPE_LASTS_M = 28.0, 40.0
-# The lattice of the relief, and the share of the hills there: roads are laid out level where one drives, hills begin
-# some way off, with their crests or troughs at the car.
+# The lattice of the relief, and the fraction of the hills there: roads are level where one drives, hills begin
+# at some distance, with their crests or troughs at the car.
 _AXIS_M = np.arange(-RELIEF_HALF_M, RELIEF_HALF_M + RELIEF_STEP_M / 2, RELIEF_STEP_M)
 _X_M, _Y_M = np.meshgrid(_AXIS_M, _AXIS_M, indexing="ij")
 _BEGUN = 1.0 - np.exp(-(_X_M**2 + _Y_M**2) / LEVEL_WITHIN_M**2)
@@ -25,10 +25,10 @@ _BEGUN = 1.0 - np.exp(-(_X_M**2 + _Y_M**2) / LEVEL_WITHIN_M**2)
 
 @dataclass(frozen=True)
 class Ground:
-    """The surface under one scene.
+    """Ground surface of one scene.
 
     Attributes:
-        street: its carriageways, kerbs, banks and tracks.
+        street: carriageways, kerbs, banks and tracks.
         relief: (R,R) heights in metres on a square lattice of RELIEF_STEP_M around the car, x by rows.
         reflectance: (6,) of asphalt, pavement, verge, marking, rail, ballast.
         z_m: height of the ground under the car in the LiDAR frame.
@@ -56,12 +56,12 @@ class Ground:
 
     @property
     def cross_half_m(self) -> float:
-        """Half the width of the crossing road; 0 where there is none."""
+        """Half the width of the crossing road; 0 without one."""
         return self.street.cross_half_m
 
     @property
     def rails_v_m(self) -> float | None:
-        """Middle of a track in road coordinates, of the left one of two, if there is any."""
+        """Middle of a track in road coordinates, of the left one of two; None without tracks."""
         v = self.street.rails_v_m
         if v <= NO_RAILS:
             return None
@@ -75,7 +75,7 @@ class Ground:
         return max(self.half_width_m, second, bed)
 
     def to_lidar(self, u_m: float, v_m: float, yaw_rad: float = 0.0) -> tuple[float, float, float]:
-        """Road coordinates and a heading against the road -> x, y, heading in the LiDAR frame."""
+        """Convert road coordinates and a heading relative to the road -> x, y, heading in the LiDAR frame."""
         street = self.street
         cos, sin, bend = street.cos_yaw, street.sin_yaw, street.bend_per_m
         across = v_m + street.offset_m + 0.5 * bend * u_m * u_m
@@ -83,14 +83,14 @@ class Ground:
         return float(u_m * cos - across * sin), float(u_m * sin + across * cos), float(yaw)
 
     def to_road(self, x_m: float, y_m: float) -> tuple[float, float]:
-        """A place in the LiDAR frame -> u, v in road coordinates."""
+        """Convert a position in the LiDAR frame -> u, v in road coordinates."""
         street = self.street
         cos, sin = street.cos_yaw, street.sin_yaw
         u, v = x_m * cos + y_m * sin, y_m * cos - x_m * sin
         return u, v - street.offset_m - 0.5 * street.bend_per_m * u * u
 
     def cross_to_lidar(self, along_m: float, across_m: float, yaw_rad: float = 0.0) -> tuple[float, float, float]:
-        """The same for the crossing road: along it to the left of the main road, across it ahead."""
+        """Convert as `to_lidar` for the crossing road: along it to the left of the main road, across it ahead."""
         street = self.street
         cos, sin = street.cos_tilt, street.sin_tilt
         u = street.cross_u_m + across_m * cos - along_m * sin
@@ -98,7 +98,7 @@ class Ground:
         return x, y, float(street.yaw_rad + street.cross_tilt_rad + math.pi / 2 + yaw_rad)
 
     def places(self, along_m: Floats, across_m: Floats, cross: Mask) -> Floats:
-        """`to_lidar` or, where `cross` (N,), `cross_to_lidar` of many: (N,) and (N,) -> (N,2) x and y."""
+        """Return `to_lidar` or, where `cross` (N,), `cross_to_lidar` of many: (N,) and (N,) -> (N,2) x and y."""
         street, u, v = self.street, along_m.copy(), across_m.copy()
         cos, sin = street.cos_tilt, street.sin_tilt
         u[cross] = street.cross_u_m + across_m[cross] * cos - along_m[cross] * sin
@@ -110,23 +110,23 @@ class Ground:
         return result
 
     def headings(self, along_m: Floats, cross: Mask) -> Floats:
-        """The road's heading (N,) in the LiDAR frame there."""
+        """Return the road's heading (N,) in the LiDAR frame there."""
         street = self.street
         # NumPy's arc tangent differs from that of `to_lidar` in the last bit.
         turns = np.array([math.atan(slope) for slope in (street.bend_per_m * along_m).tolist()])
         return np.where(cross, street.yaw_rad + street.cross_tilt_rad + math.pi / 2, street.yaw_rad + turns)
 
     def heights(self, xy: ArrayLike) -> Floats:
-        """Height (N,) of the ground at (N,2) in the LiDAR frame, metres."""
+        """Return the height (N,) of the ground at (N,2) in the LiDAR frame, metres."""
         points = np.asarray(xy, float).reshape(-1, 2)
         return np.asarray(groundcast.heights(points, self.street, self.relief, self.z_m))
 
 
 def make_street(**numbers: float) -> Street:
-    """A street of the numbers given by name; what is left out is 0 or absent.
+    """Return a street with the named numbers; others are 0 or absent.
 
     Raises:
-        TypeError: a name that no street has.
+        TypeError: an unknown name.
     """
     given = dict.fromkeys(Street._fields, 0.0) | {"rails_v_m": NO_RAILS} | {k: float(v) for k, v in numbers.items()}
     yaw, tilt = given["yaw_rad"], given["cross_tilt_rad"]
@@ -149,13 +149,13 @@ def draw_relief(
     street: Street | None = None,
     bump_m: float = 0.0,
 ) -> Floats:
-    """Heights (R,R) of hills, metres.
+    """Draw the heights (R,R) of hills, metres.
 
     They are a plane of `slope` (x, y) that levels out far away, long waves that are level under the car, and bumps of
     standard deviation `bump_m` beyond the pavements of `street`.
     """
     x, y, begun = _X_M, _Y_M, _BEGUN
-    # A slope lasts as far as one sees the street; KITTI's far ground lies as high, on average, as that near the car.
+    # A slope extends over the visible street; KITTI's far ground is as high, on average, as that near the car.
     lasting = SLOPE_LASTS_M * np.tanh(_AXIS_M / SLOPE_LASTS_M)
     height: Any = slope[0] * lasting[:, None] + slope[1] * lasting[None, :]
     for wavelength in (160.0, 90.0, 45.0):

@@ -1,4 +1,4 @@
-"""Places where road users of each class stand, drive and walk on a street; u along it, v to its left."""
+"""Positions of road users of each class on a street, standing or moving; u along it, v to its left."""
 
 from typing import Literal, NamedTuple, TypeAlias
 
@@ -13,11 +13,11 @@ NOSE_IN_M, ALONG_M = (0.5, 1.1), (0.4, 1.8)  # gaps between parked cars side by 
 
 
 Going: TypeAlias = Literal["still", "lane", "crossing", "riding", "walking"]
-"""Motion of an object: invisible in a single scan, followed in a sequence."""
+"""Motion of an object: used in a sequence, not in a single scan."""
 
 
 class Neighbor(NamedTuple):
-    """Position of an object that others may stand beside: metres, heading against the street, length of its box."""
+    """Position of an object that others may be next to: metres, heading relative to the street, length of its box."""
 
     u: float
     v: float
@@ -26,17 +26,17 @@ class Neighbor(NamedTuple):
 
 
 class Candidate(NamedTuple):
-    """A place for an object, before it is known to be free."""
+    """Pose for an object, before a check that it is free."""
 
     place: tuple[float, float, float]  # x, y, heading in the LiDAR frame
-    company: list[Neighbor] | None = None  # of what stands there, once it does, it becomes one
+    company: list[Neighbor] | None = None  # list that it joins as a neighbor once it is placed
     neighbor: Neighbor | None = None
-    half_hidden: bool = False  # something shall stand before it
+    half_hidden: bool = False  # to be partly occluded by another object
     going: Going = "still"
 
 
 class Habits:
-    """Draws places for the objects of one scene, many of them beside others that stand already."""
+    """Sampler of poses for the objects of one scene, many of them next to others already placed."""
 
     def __init__(self, rng: np.random.Generator, config: SceneConfig, ground: Ground, kind: str) -> None:
         self.rng, self.config, self.ground = rng, config, ground
@@ -46,7 +46,7 @@ class Habits:
         self.traffic: list[Neighbor] = []
         self.people: list[Neighbor] = []
         self.riders: list[Neighbor] = []
-        # Zebra crossings lie where roads meet, or anywhere: one ahead, one behind.
+        # Zebra crossings are at junctions, or anywhere: one ahead, one behind.
         at_junction = ground.cross_half_m > 0 and rng.random() < config.zebra_at_junction
         beside = ground.cross_u_m - rng.choice([-1.0, 1.0]) * (ground.cross_half_m + 2.5)
         anywhere = float(rng.uniform(6.0, 45.0))
@@ -56,7 +56,7 @@ class Habits:
         )
 
     def vehicle(self, size: Floats, way: float) -> Candidate:
-        """A car, van, truck or trailer: parked, in a yard, half hidden aside, on the crossing road, or on its way.
+        """Return a pose for a car, van, truck or trailer: parked, in a yard, partly occluded, crossing, or driving.
 
         Its size (3,) is length, width and height in metres; `way` is 1 ahead of the sensor and -1 behind it, here and
         below.
@@ -75,7 +75,7 @@ class Habits:
         return self._moving(size, way)
 
     def tram(self, size: Floats, way: float) -> Candidate:
-        """A tram of size (3,) in metres on its track, or beside the road."""
+        """Return a pose for a tram of size (3,) in metres on its track, or beside the road."""
         rails = self.ground.rails_v_m
         v = self.ground.half_width_m + 3.0 if rails is None else rails
         return Candidate(
@@ -83,7 +83,7 @@ class Habits:
         )
 
     def pedestrian(self, size: Floats, way: float) -> Candidate:
-        """A person of size (3,), metres, alone or in company; along the street, across the line of sight, or anyhow."""
+        """Return a pose for a pedestrian of size (3,), metres, alone or in company; along the street or across it."""
         rng, config, ground = self.rng, self.config, self.ground
         half, pavement = ground.half_width_m, ground.pavement_m
         if self.people and rng.random() < config.in_company:
@@ -106,7 +106,7 @@ class Habits:
         return self._at(self.people, u, v, heading, going="walking")
 
     def _turned(self, heading: float, u: float, v: float) -> float:
-        """A walker's heading against the street: as given, anyhow, or across the line of sight."""
+        """Return a walker's heading relative to the street: the given one, random, or across the line of sight."""
         rng, config = self.rng, self.config
         if rng.random() < config.pedestrian_uniform_heading:
             return float(rng.uniform(-np.pi, np.pi))
@@ -116,7 +116,7 @@ class Habits:
         return heading
 
     def companion(self) -> tuple[float, float, float]:
-        """u, v and heading of somebody beside another one with the same heading, behind, or face to face."""
+        """Return u, v and heading of a person next to another one with the same heading, behind, or face to face."""
         rng, config = self.rng, self.config
         of = self.people[int(rng.integers(len(self.people)))]
         habit = rng.random()
@@ -132,7 +132,7 @@ class Habits:
         return float(of.u + along * cos - across * sin), float(of.v + along * sin + across * cos), of.heading + turn
 
     def sitting(self, size: Floats, way: float) -> Candidate:
-        """A person of size (3,) in metres on a bench or a chair beside the street, or at somebody's table."""
+        """Return a pose for a person of size (3,) in metres on a bench or a chair beside the street, or at a table."""
         rng, ground = self.rng, self.ground
         if self.people and rng.random() < 0.4:
             other = self.people[int(rng.integers(len(self.people)))]
@@ -143,7 +143,7 @@ class Habits:
         return self._at(self.people, u, v, rng.uniform(-np.pi, np.pi))
 
     def cyclist(self, size: Floats, way: float) -> Candidate:
-        """A cyclist of size (3,) in metres on the road or beside it, along or across it, some in company."""
+        """Return a pose for a cyclist of size (3,) in metres, on the road or beside it, along or across it."""
         rng, config, half = self.rng, self.config, self.ground.half_width_m
         if self.riders and rng.random() < config.riding_together:  # side by side, or one behind the other
             u, v, heading, _ = self.riders[int(rng.integers(len(self.riders)))]
@@ -172,20 +172,20 @@ class Habits:
         *,
         going: Going = "still",
     ) -> Candidate:
-        """A candidate beside which others of `company` may stand; `sway` is the spread of its place and heading."""
+        """Return a candidate that joins `company` once placed; `sway` is the spread of its position and heading."""
         across, turn = (float(self.rng.normal(0.0, spread)) if spread else 0.0 for spread in sway)
         place = self.ground.to_lidar(u, v + across, heading + turn)
         return Candidate(place, company, Neighbor(float(u), float(v), float(heading), float(length)), going=going)
 
     def _distance(self, shape: float, scale: float) -> float:
-        """Along the street, metres: by KITTI's labels where its camera looks, and as many beside the car."""
+        """Return a distance along the street, metres: as KITTI's labels in the camera's view, or beside the car."""
         if self.rng.random() < self.config.alongside:
             return float(self.rng.uniform(0.0, 7.0))
         distance = float(self.rng.gamma(shape, scale))
         return distance if 2.0 < distance < self.config.reach_m else float(self.rng.uniform(2.0, self.config.reach_m))
 
     def _crossing(self) -> Candidate:
-        """On the crossing road, where traffic keeps to its right too."""
+        """Return a pose on the crossing road, in the right-hand lane."""
         rng, ground = self.rng, self.ground
         lane = -1.0 if rng.random() < 0.5 else 1.0
         across = lane * ground.cross_half_m * rng.uniform(0.4, 0.65)
@@ -193,7 +193,7 @@ class Habits:
         return Candidate(ground.cross_to_lidar(rng.uniform(-45.0, 45.0), across, heading), going="crossing")
 
     def _parked(self, size: Floats, way: float) -> Candidate:
-        """At the kerb, half on the pavement or nose in; mostly next to one that is parked already."""
+        """Return a pose at the kerb, half on the pavement or nose in; mostly next to a parked one."""
         rng, config, half = self.rng, self.config, self.ground.half_width_m
         if self.parked and rng.random() < config.next_to_parked:
             u, v, heading, length = self.parked[int(rng.integers(len(self.parked)))]
@@ -216,14 +216,14 @@ class Habits:
         return self._at(self.parked, u, v, heading, size[0], sway=(0.08, 0.02))
 
     def _off_street(self, size: Floats, way: float) -> Candidate:
-        """In drives, yards and car parks, where the next one may stand beside it."""
+        """Return a pose in drives, yards and car parks, where others may be next to it."""
         rng, ground = self.rng, self.ground
         v = (1.0 if rng.random() < 0.6 else -1.0) * (ground.half_width_m + ground.pavement_m + rng.uniform(2.0, 22.0))
         heading = float(rng.choice(QUARTER_TURNS, p=[0.3, 0.3, 0.2, 0.2])) + rng.normal(0, 0.12)
         return self._at(self.parked, way * self._distance(2.0, 15.0), v, heading, size[0])
 
     def _half_hidden(self, way: float) -> Candidate:
-        """Some way off to the side; what stands before it hides a part of it."""
+        """Return a pose at some distance to the side, to be partly occluded."""
         rng, config = self.rng, self.config
         u = way * rng.uniform(*config.half_hidden_ahead_m)
         v = rng.choice([-1.0, 1.0]) * rng.uniform(*config.half_hidden_aside_m)
@@ -233,7 +233,7 @@ class Habits:
         return Candidate(self.ground.to_lidar(u, v, heading), half_hidden=True)
 
     def _moving(self, size: Floats, way: float) -> Candidate:
-        """In a lane, alone or behind or before another one."""
+        """Return a pose in a lane, alone or behind or before another one."""
         rng, config, half = self.rng, self.config, self.ground.half_width_m
         if self.traffic and rng.random() < config.in_queue:
             u, v, heading, length = self.traffic[int(rng.integers(len(self.traffic)))]

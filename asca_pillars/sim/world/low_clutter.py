@@ -1,7 +1,7 @@
-"""Things that end at a person's hip or shoulder, and corners of low walls.
+"""Objects of the height of a person's hip or shoulder, and corners of low walls.
 
-Detectors trained on streets without them take bollards, litter bins, low signs and stones in KITTI's drives for people
-and cyclists (half of the false people there are lower than 1.2 m), and corners of walls and groups of posts for cars.
+Detectors trained without them detect bollards, litter bins, low signs and stones in KITTI's drives as pedestrians
+and cyclists (half of these false positives are lower than 1.2 m), and corners of walls and groups of posts as cars.
 """
 
 import numpy as np
@@ -19,7 +19,7 @@ def _foil(builder: Builder) -> float:
 
 
 def banded_bollards(builder: Builder, along: float, across: float) -> None:
-    """A row of bollards along the kerb, half of the rows with a bright band, now and then a pole among them."""
+    """Add a row of bollards along the kerb, half of the rows with a bright band, sometimes with a pole."""
     rng = builder.rng
     radius, tall, step = float(rng.uniform(0.05, 0.11)), float(rng.uniform(0.85, 1.1)), float(rng.uniform(1.1, 1.6))
     dark = float(rng.uniform(0.04, 0.4))
@@ -36,7 +36,7 @@ def banded_bollards(builder: Builder, along: float, across: float) -> None:
 
 
 def litter_bin(builder: Builder, along: float, across: float) -> None:
-    """A bin that hangs on a post with a gap below, mostly with a sticker, sometimes with another thing beside it."""
+    """Add a bin on a post with a gap below, mostly with a sticker, sometimes with another object beside it."""
     rng = builder.rng
     wide, deep = float(rng.uniform(0.3, 0.45)), float(rng.uniform(0.28, 0.4))
     if not builder.reserve(along, across, 0.5, 0.5):
@@ -54,7 +54,7 @@ def litter_bin(builder: Builder, along: float, across: float) -> None:
 
 
 def cabinet_and_panel(builder: Builder, along: float, across: float) -> None:
-    """A low cabinet right beside a higher panel, which sometimes has a bright sign on top."""
+    """Add a low cabinet right beside a higher panel, sometimes with a bright sign on top."""
     rng = builder.rng
     if not builder.reserve(along, across, 1.3, 0.5):
         return
@@ -69,7 +69,7 @@ def cabinet_and_panel(builder: Builder, along: float, across: float) -> None:
 
 
 def before_a_wall(builder: Builder, along: float, across: float) -> None:
-    """Low pieces a hand's to an arm's length before a wall: a bench, a box hedge, a table, somebody's bag."""
+    """Add low pieces at up to an arm's length before a wall: a bench, a box hedge, a table, a bag."""
     rng = builder.rng
     length, side = float(rng.uniform(3.0, 8.0)), 1.0 if across > 0 else -1.0
     gap = float(rng.uniform(0.3, 0.8))
@@ -88,7 +88,7 @@ def before_a_wall(builder: Builder, along: float, across: float) -> None:
 
 
 def footed_trunk(builder: Builder, along: float, across: float) -> None:
-    """A trunk or an advertising column that widens towards the ground, without a branch as far up as one sees."""
+    """Add a trunk or an advertising column that widens towards the ground, without visible branches."""
     rng = builder.rng
     radius, foot = float(rng.uniform(0.13, 0.26)), float(rng.uniform(0.3, 0.48))
     if not builder.reserve(along, across, 2 * foot, 2 * foot):
@@ -102,7 +102,7 @@ def footed_trunk(builder: Builder, along: float, across: float) -> None:
 
 
 def tapered_stone(builder: Builder, along: float, across: float) -> None:
-    """A stone, a hydrant, a cone of concrete: broad below, narrow above, as high as a person's chest."""
+    """Add a stone, a hydrant or a concrete cone: broad below, narrow above, as high as a person's chest."""
     rng = builder.rng
     foot = float(rng.uniform(0.2, 0.32))
     for i in range(int(rng.choice([1, 1, 2]))):
@@ -113,7 +113,7 @@ def tapered_stone(builder: Builder, along: float, across: float) -> None:
 
 
 def slim_pillars(builder: Builder, along: float, across: float) -> None:
-    """An upright post or stone as tall as a person, without a head, and a lower one beside it or leaning at it."""
+    """Add an upright post or stone as tall as a person, without a head, and a lower one beside it or leaning on it."""
     rng = builder.rng
     if not builder.reserve(along, across, 1.2, 0.6):
         return
@@ -127,7 +127,7 @@ def slim_pillars(builder: Builder, along: float, across: float) -> None:
 
 
 def low_sign(builder: Builder, along: float, across: float) -> None:
-    """A disc or a plate at a person's height on a post that mostly goes on above; its back is dark."""
+    """Add a disc or a plate at a person's height on a post that mostly continues above; its back is dark."""
     rng = builder.rng
     if not builder.reserve(along, across, 0.6, 0.6):
         return
@@ -146,7 +146,7 @@ def low_sign(builder: Builder, along: float, across: float) -> None:
 
 
 def warning_barrier(builder: Builder, along: float, across: float) -> None:
-    """A bright board across the way of sight on legs that hardly return, or on a tripod."""
+    """Add a bright board across the line of sight on legs with hardly any returns, or on a tripod."""
     rng = builder.rng
     wide = float(rng.uniform(0.5, 1.7))
     if not builder.reserve(along, across, 0.6, wide):
@@ -159,7 +159,7 @@ def warning_barrier(builder: Builder, along: float, across: float) -> None:
 
 
 def bicycle_at_post(builder: Builder, along: float, across: float) -> None:
-    """A parked bicycle that leans at a post or a trunk, which stands out of it on both sides."""
+    """Add a parked bicycle leaning on a post or a trunk, which is visible on both sides."""
     rng = builder.rng
     if not builder.reserve(along, across, 1.8, 0.7):
         return
@@ -170,7 +170,7 @@ def bicycle_at_post(builder: Builder, along: float, across: float) -> None:
 
 
 def wall_corner(builder: Builder, along: float, across: float) -> None:
-    """The corner of a low wall, a raised bed or a clipped hedge, open behind: two faces as a car shows them."""
+    """Add the corner of a low wall, a raised bed or a clipped hedge, open behind: two faces like those of a car."""
     rng = builder.rng
     long, short = float(rng.uniform(2.0, 4.5)), float(rng.uniform(1.2, 2.2))
     if not builder.reserve(along, across, long, short):
@@ -184,7 +184,7 @@ def wall_corner(builder: Builder, along: float, across: float) -> None:
 
 
 def posts_at_corners(builder: Builder, along: float, across: float) -> None:
-    """Three or four low things about where the corners of a parked car would be, and nothing between them."""
+    """Add three or four low objects near the corners of an absent parked car."""
     rng = builder.rng
     long, wide = float(rng.uniform(3.0, 4.6)), float(rng.uniform(1.3, 1.9))
     if not builder.reserve(along, across, long, wide):

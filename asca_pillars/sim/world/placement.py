@@ -1,4 +1,4 @@
-"""Labelled objects on their street: sizes by KITTI's statistics, and places where nothing stands in anything else."""
+"""Labelled objects on their street: sizes by KITTI's statistics, and free positions."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -28,7 +28,7 @@ class SizeStatistics:
 
     @cached_property
     def spread(self) -> Floats:
-        """(3,3) turning independent normal numbers into deviations, metres."""
+        """(3,3) matrix from independent normal numbers to deviations, metres."""
         lw, lh, wh = self.correlation
         factor = np.linalg.cholesky(np.array([[1.0, lw, lh], [lw, 1.0, wh], [lh, wh, 1.0]]))
         return np.asarray(np.array(self.deviation)[:, None] * factor)
@@ -67,7 +67,7 @@ MOTORCYCLE_SHARE = 0.2  # of Misc, whose smallest quarter is two-wheelers
 
 
 def draw_size(rng: np.random.Generator, name: str) -> Floats:
-    """(3,) length, width, height of a label box, metres."""
+    """Draw (3,) length, width, height of a label box, metres."""
     if name == "Misc" and rng.random() < MOTORCYCLE_SHARE:
         return rng.uniform((1.7, 0.60, 1.45), (2.3, 0.90, 1.85))
     if name == "Car" and rng.random() < MICROCAR_SHARE:
@@ -82,9 +82,9 @@ def draw_size(rng: np.random.Generator, name: str) -> Floats:
 
 @dataclass
 class Occupied:
-    """Footprints that are taken; they grow in number as things are placed.
+    """Occupied footprints, extended as objects are placed.
 
-    Rows are x, y, length, width, yaw, and by how much it may overlap others that may overlap.
+    Rows are x, y, length, width, yaw, and the allowed overlap with others that allow one.
     """
 
     rows: Floats = field(default_factory=lambda: np.zeros((2048, 6)))
@@ -97,7 +97,7 @@ class Occupied:
 
         Two footprints may overlap by the lesser `overlap_m` of theirs.
         """
-        # Plain floats, so that one compiled version answers every caller.
+        # Plain floats, so that one compiled version serves every caller.
         sides = float(length + 2 * margin_m), float(width + 2 * margin_m)
         wish = (float(x), float(y), *sides, float(yaw), float(overlap_m))
         if self.count == len(self.rows) or not _is_free(wish, self.rows, self.count):
@@ -107,7 +107,7 @@ class Occupied:
         return True
 
     def hold(self, x: float, y: float, length: float, width: float, yaw: float) -> None:
-        """Take a footprint, free or not, for what will move there; nothing that comes later stands in it."""
+        """Occupy a footprint, free or not, for a moving object; later objects are placed outside."""
         if self.count == len(self.rows):
             self.rows = np.concatenate([self.rows, np.zeros_like(self.rows)])
         self.rows[self.count] = x, y, length, width, yaw, 0.0
@@ -122,7 +122,7 @@ def _is_free(row: tuple[float, float, float, float, float, float], rows: Floats,
         taken = (rows[i, 2], rows[i, 3], rows[i, 4])
         dx, dy = rows[i, 0] - row[0], rows[i, 1] - row[1]
         if max(abs(dx), abs(dy)) > (own[0] + own[1] + taken[0] + taken[1]) / 2:
-            continue  # farther than half the diagonals reach
+            continue  # farther apart than half the diagonals
         apart = False
         overlap = min(row[5], rows[i, 5])
         for one, other in ((own, taken), (taken, own)):
@@ -143,14 +143,14 @@ ON_FOOT = ("Pedestrian", "Person_sitting")
 TRIES = 14
 MARGIN_M = {"Pedestrian": 0.02, "Person_sitting": 0.04, "Cyclist": 0.10}
 VEHICLE_MARGIN_M = 0.25
-PEDESTRIANS_OVERLAP_M = 0.15  # boxes of people who walk side by side share that much
+PEDESTRIANS_OVERLAP_M = 0.15  # boxes of people walking side by side overlap by that
 
 
 @dataclass(frozen=True)
 class Target:
-    """A labelled object: KITTI type and label box (x, y, z, length, width, height, yaw).
+    """Labelled object: KITTI type and label box (x, y, z, length, width, height, yaw).
 
-    The body stands on the ground, `lift_m` below the bottom of the box. `going` is what it does, `walked_m` how far it
+    The body is on the ground, `lift_m` below the bottom of the box. `going` is its motion, `walked_m` the distance it
     has walked since it was placed.
     """
 
@@ -163,7 +163,7 @@ class Target:
 
 @dataclass
 class Placer:
-    """Puts the objects of one scene on its street."""
+    """Placement of the objects of one scene on its street."""
 
     rng: np.random.Generator
     config: SceneConfig
@@ -171,7 +171,7 @@ class Placer:
     occupied: Occupied
     kind: str
     targets: list[Target] = field(default_factory=list)
-    half_hidden: list[Target] = field(default_factory=list)  # those of `targets` before which something shall stand
+    half_hidden: list[Target] = field(default_factory=list)  # those of `targets` to be partly occluded
 
     def __post_init__(self) -> None:
         self.habits = Habits(self.rng, self.config, self.ground, self.kind)
@@ -196,7 +196,7 @@ class Placer:
                 return
 
     def place_beyond(self) -> None:
-        """Place a car ahead that is out of the sensor's reach but not out of the camera's sight."""
+        """Place a car ahead that is beyond the sensor's range but visible to the camera."""
         size = draw_size(self.rng, "Car")
         lane = self.rng.uniform(-1.2, 1.2) * (self.ground.half_width_m + 2.0)
         heading = self.rng.choice([0.0, np.pi])

@@ -1,4 +1,4 @@
-"""Linings of the streets on both sides: houses, walls, fences, guard rails, and the end of the view far behind."""
+"""Linings of the streets on both sides: houses, walls, fences, guard rails, and the distant background."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -10,13 +10,13 @@ from asca_pillars.sim.world.vegetation import hedge, overgrow, tree, trees, wood
 
 
 def wall(builder: Builder, stretch: Stretch) -> None:
-    """A wall, sometimes with pillars, sometimes of steps that follow the slope."""
+    """Add a wall, sometimes with pillars, sometimes in steps along the slope."""
     rng = builder.rng
     _wall(builder, stretch, float(rng.uniform(0.3, 2.4)), pillars=bool(rng.random() < 0.4))
 
 
 def high_wall(builder: Builder, stretch: Stretch) -> None:
-    """A wall above the eye: against noise, of a yard, of an underpass."""
+    """Add a wall above eye level: a noise barrier, of a yard, of an underpass."""
     _wall(builder, stretch, float(builder.rng.uniform(2.4, 5.0)), pillars=bool(builder.rng.random() < 0.3))
 
 
@@ -34,7 +34,7 @@ def _wall(builder: Builder, stretch: Stretch, height: float, pillars: bool) -> N
 
 
 def fence(builder: Builder, stretch: Stretch) -> None:
-    """Boards, pickets or wire between posts: the thinner, the more rays pass."""
+    """Add boards, pickets or wire between posts: the thinner, the more rays pass."""
     rng, across, cross = builder.rng, stretch.side * stretch.away_m, stretch.cross
     height, step = float(rng.uniform(0.8, 2.2)), float(rng.uniform(2.0, 3.5))
     reflectance = float(rng.uniform(0.15, 0.55))
@@ -46,7 +46,7 @@ def fence(builder: Builder, stretch: Stretch) -> None:
 
 
 def railing(builder: Builder, stretch: Stretch) -> None:
-    """A low wall with bars on it between pillars, often with a hedge behind."""
+    """Add a low wall with bars on it between pillars, often with a hedge behind."""
     rng, side, cross = builder.rng, stretch.side, stretch.cross
     across = side * stretch.away_m
     base, top, thick = float(rng.uniform(0.15, 0.9)), float(rng.uniform(0.9, 1.7)), float(rng.uniform(0.15, 0.35))
@@ -65,7 +65,7 @@ def railing(builder: Builder, stretch: Stretch) -> None:
 
 
 def bars(builder: Builder, stretch: Stretch) -> None:
-    """Pedestrians' railing: posts and two or three level tubes."""
+    """Add a pedestrian railing: posts and two or three level tubes."""
     rng, across, cross = builder.rng, stretch.side * stretch.away_m, stretch.cross
     height, step = float(rng.uniform(0.7, 1.2)), float(rng.uniform(1.5, 2.5))
     steel: Material = (float(rng.uniform(0.15, 0.5)), 0.5, 0.0)
@@ -78,7 +78,7 @@ def bars(builder: Builder, stretch: Stretch) -> None:
 
 
 def guard_rail(builder: Builder, stretch: Stretch) -> None:
-    """A steel rail on posts, single or on both sides of them."""
+    """Add a steel rail on posts, single or on both sides of them."""
     rng = builder.rng
     steel: Material = (float(rng.uniform(0.2, 0.5)), 0.8, 0.0)
     across, cross = stretch.side * stretch.away_m, stretch.cross
@@ -93,7 +93,7 @@ def guard_rail(builder: Builder, stretch: Stretch) -> None:
 
 
 def concrete_barrier(builder: Builder, stretch: Stretch) -> None:
-    """Blocks with a broad foot, as beside trunk roads and works."""
+    """Add blocks with a broad foot, as beside trunk roads and works."""
     rng, across, cross = builder.rng, stretch.side * stretch.away_m, stretch.cross
     stone: Material = (float(rng.uniform(0.2, 0.45)), 0.3, 0.0)
     height = float(rng.uniform(0.75, 1.1))
@@ -104,7 +104,7 @@ def concrete_barrier(builder: Builder, stretch: Stretch) -> None:
 
 
 def building(builder: Builder, stretch: Stretch) -> None:
-    """Houses side by side, some a little forward or back, some with a passage between them."""
+    """Add houses side by side, some slightly forward or back, some with a passage between them."""
     rng = builder.rng
     depth, height = float(rng.uniform(5.0, 10.0)), float(rng.uniform(3.2, 9.0))
     width = stretch.length_m / max(int(stretch.length_m // 8.0), 1)
@@ -119,7 +119,7 @@ def building(builder: Builder, stretch: Stretch) -> None:
 def _house(
     builder: Builder, middle: float, side: float, away: float, size: tuple[float, float, float], cross: bool
 ) -> None:
-    """A core with recessed windows behind pillars, plinth and lintel; steps, balconies, awnings, drainpipes."""
+    """Add a core with recessed windows behind pillars, plinth and lintel; steps, balconies, awnings, drainpipes."""
     rng, (width, depth, height) = builder.rng, size
     recess = float(rng.uniform(0.06, 0.35))
     stone: Material = (float(rng.uniform(0.2, 0.6)), 0.3, 0.0)
@@ -179,7 +179,7 @@ def close_view(builder: Builder, along: float, half_width: float) -> None:
 
 
 def garages(builder: Builder, stretch: Stretch) -> None:
-    """Flat boxes with recessed gates, open ones here and there, set back from the street."""
+    """Add flat boxes with recessed gates, some of them open, set back from the street."""
     rng, side, cross = builder.rng, stretch.side, stretch.cross
     height, depth = float(rng.uniform(2.1, 2.7)), float(rng.uniform(4.5, 6.5))
     stone: Material = (float(rng.uniform(0.2, 0.6)), 0.3, 0.0)
@@ -198,7 +198,7 @@ def garages(builder: Builder, stretch: Stretch) -> None:
 
 
 def open_roof(builder: Builder, stretch: Stretch) -> None:
-    """A carport, a pergola, a petrol station: a roof on posts."""
+    """Add a carport, a pergola, a petrol station: a roof on posts."""
     rng, side, cross = builder.rng, stretch.side, stretch.cross
     deep, height = float(rng.uniform(2.5, 6.0)), float(rng.uniform(2.0, 3.5))
     beam: Material = (float(rng.uniform(0.15, 0.5)), 0.3, float(rng.choice([0.0, 0.5])))
@@ -212,7 +212,7 @@ def open_roof(builder: Builder, stretch: Stretch) -> None:
 
 
 def scaffolding(builder: Builder, stretch: Stretch) -> None:
-    """Thin tubes and planks before a wall."""
+    """Add thin tubes and planks before a wall."""
     rng, side, cross = builder.rng, stretch.side, stretch.cross
     wood: Material = (float(rng.uniform(0.22, 0.6)), 0.3, 0.0)
     net: Material = (0.25, 0.3, float(rng.choice([0.6, 0.9, 1.0])))
@@ -233,7 +233,7 @@ AVENUE_SHARE = {"residential": 0.2, "urban": 0.35, "rural": 0.15, "campus": 0.3,
 
 
 def line_streets(builder: Builder) -> None:
-    """Both sides of both roads, the strip between two carriageways, and houses and woods far behind them."""
+    """Add both sides of both roads, the strip between two carriageways, and distant houses and woods."""
     ground = builder.ground
     half, pavement = ground.half_width_m, ground.pavement_m
     for side in (1.0, -1.0):
@@ -263,7 +263,7 @@ def _line(builder: Builder, whole: Stretch) -> None:
     setback = float(rng.uniform(0.0, {"urban": 1.5, "alley": 0.5}.get(kind, 4.5)))
     if kind in ("road", "rural") and rng.random() < 0.5:
         _everywhere(builder, guard_rail, replace(whole, away_m=whole.away_m - 0.2))
-    # On some streets one thing goes on and on; on others every neighbor has chosen otherwise.
+    # Some streets have one lining throughout; on others it changes between neighbors.
     longest = float(rng.choice([16.0, 30.0, 60.0]))
     start, end = whole.start_m, whole.start_m + whole.length_m
     while start < end:
@@ -288,7 +288,7 @@ def _line(builder: Builder, whole: Stretch) -> None:
 
 
 def _everywhere(builder: Builder, make: Lining, whole: Stretch) -> None:
-    """One lining along a whole side, open at a junction only."""
+    """Add one lining along a whole side, open at a junction only."""
     if whole.cross:
         make(builder, whole)
         return
@@ -301,7 +301,7 @@ def _everywhere(builder: Builder, make: Lining, whole: Stretch) -> None:
 
 
 def _part_carriageways(builder: Builder) -> None:
-    """Rails, hedges, trees or nothing on the strip between two carriageways."""
+    """Add rails, hedges, trees or nothing on the strip between two carriageways."""
     rng, ground = builder.rng, builder.ground
     makers: tuple[Lining, ...] = (guard_rail, guard_rail, concrete_barrier, hedge, trees, bars, lawn)
     make = makers[int(rng.integers(len(makers)))]
@@ -311,7 +311,7 @@ def _part_carriageways(builder: Builder) -> None:
 
 
 def _backdrop(builder: Builder, side: float, edge: float) -> None:
-    """Houses and woods behind the second row, with some gaps: few views in a valley are open to the horizon."""
+    """Add houses and woods behind the second row, with some gaps: few views in a valley extend to the horizon."""
     rng = builder.rng
     away, share = float(rng.uniform(14.0, 40.0)), float(rng.uniform(0.55, 1.0))
     start = -85.0
@@ -326,7 +326,7 @@ def _backdrop(builder: Builder, side: float, edge: float) -> None:
 
 
 def _avenue(builder: Builder, side: float) -> None:
-    """Trees right behind the kerb, whose crowns begin above most lasers."""
+    """Add trees right behind the kerb, whose crowns begin above most lasers."""
     rng, half = builder.rng, builder.ground.half_width_m
     step, tall = float(rng.uniform(5.0, 14.0)), float(rng.uniform(2.2, 5.0))
     across = side * (half + float(rng.uniform(0.4, max(0.8, 0.5 * builder.ground.pavement_m))))
@@ -336,7 +336,7 @@ def _avenue(builder: Builder, side: float) -> None:
 
 
 def lawn(builder: Builder, stretch: Stretch) -> None:
-    """Open ground, perhaps with one tree."""
+    """Add open ground, perhaps with one tree."""
     if builder.rng.random() < 0.5:
         away = stretch.away_m + builder.rng.uniform(0.3, 8.0)
         tree(builder, stretch.middle_m, stretch.side * away, stretch.cross)

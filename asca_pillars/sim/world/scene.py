@@ -1,4 +1,4 @@
-"""One random street: its ground, its objects, its background, its camera."""
+"""Random street: ground, objects, background and camera."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -18,22 +18,22 @@ from asca_pillars.sim.world.placement import Occupied, Placer, Target
 from asca_pillars.sim.world.roadside import line_streets
 from asca_pillars.sim.world.streets import draw_ground, draw_kind, draws_of
 
-# Kept free around the car: the sensor sees nothing within 2 m, and what stands there would blind it.
+# Kept free around the car: the sensor measures nothing within 2 m, and objects there would occlude the rest.
 KEPT_CLEAR_M = 6.0, 4.0
 BEAM_M_PER_M = 0.004  # width of a laser's beam per metre of distance
-# Factors on the rates of cars, people on foot and cyclists.
+# Factors on the rates of cars, pedestrians and cyclists.
 RATE_FACTORS = {
     "residential": (1.15, 0.75, 0.9),
     "urban": (1.0, 1.5, 1.2),
     "rural": (0.7, 0.25, 0.7),
     "campus": (0.8, 1.9, 1.4),
 }
-HABITS_OF = {"road": "rural", "alley": "residential"}  # whose habits of traffic a kind of street shares
+HABITS_OF = {"road": "rural", "alley": "residential"}  # kinds of street with the traffic of another kind
 
 
 @dataclass(frozen=True)
 class Scene:
-    """A street before it is scanned. LiDAR frame, metres."""
+    """Street before it is scanned. LiDAR frame, metres."""
 
     ground: Ground
     targets: tuple[Target, ...]
@@ -42,12 +42,12 @@ class Scene:
 
 
 def draw_scene(config: SceneConfig, rng: np.random.Generator, arrange: Callable[[Placer], None] | None = None) -> Scene:
-    """A random street with everything on it.
+    """Draw a random street with everything on it.
 
     Args:
-        config: what is drawn between which bounds.
-        rng: of the scene.
-        arrange: changes what has been placed, before anything unlabelled is put around it.
+        config: bounds of the random quantities.
+        rng: generator of the scene.
+        arrange: changes the placed objects, before unlabelled ones are added.
     """
     kind = draw_kind(config, rng)
     habits = HABITS_OF.get(kind, kind)
@@ -67,7 +67,7 @@ def draw_scene(config: SceneConfig, rng: np.random.Generator, arrange: Callable[
 
 
 def place_objects(placer: Placer) -> None:
-    """Put as many objects of every class on a street as the configuration's rates suggest, or none at all."""
+    """Place as many objects of every class on a street as the configuration's rates suggest, or none at all."""
     rng, config = placer.rng, placer.config
     if rng.random() >= config.empty_share:
         for name, rate in _rates(config, placer.kind):
@@ -82,7 +82,7 @@ def place_objects(placer: Placer) -> None:
 
 
 def _rates(config: SceneConfig, kind: str) -> tuple[tuple[str, float], ...]:
-    """Mean numbers ahead for a kind of street; large objects come first, while there is room for them."""
+    """Return mean numbers ahead for a kind of street; large objects come first, while there is room for them."""
     car, walkers, bike = RATE_FACTORS[kind]
     return (
         ("Tram", config.trams * (3.0 if kind == "urban" else 0.2)),
@@ -97,7 +97,7 @@ def _rates(config: SceneConfig, kind: str) -> tuple[tuple[str, float], ...]:
 
 
 def draw_calibration(rng: np.random.Generator) -> Calibration:
-    """A camera like one of KITTI's four recording days, a little shaken."""
+    """Return a camera like one of KITTI's four recording days, slightly perturbed."""
     f, cx, cy, shift, pitch = (
         (707.05, 604.08, 180.51, (-0.025, -0.061, -0.332), -0.001),
         (721.54, 609.56, 172.85, (-0.004, -0.076, -0.272), 0.0148),
@@ -113,7 +113,7 @@ def draw_calibration(rng: np.random.Generator) -> Calibration:
 
 
 def _rotation(turns: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    """Rotation about the camera's x, y and z axes, in this order."""
+    """Return the rotation about the camera's x, y and z axes, in this order."""
     (cx, cy, cz), (sx, sy, sz) = np.cos(turns), np.sin(turns)
     about_x = np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]])
     about_y = np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]])
@@ -122,11 +122,11 @@ def _rotation(turns: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
 
 
 def body_of(target: Target, config: SceneConfig, rng: np.random.Generator) -> Primitives:
-    """The body of an object, placed: a little smaller than its label box, as KITTI's labels are loose."""
+    """Return the placed body of an object: slightly smaller than its label box, as KITTI's labels are loose."""
     x, y, z, length, width, height, yaw = target.box
     name, footprint = target.type, BEAM_M_PER_M * float(np.hypot(x, y))
     if name in ("Car", "Van"):
-        # Annotators fit boxes to many scans of a car: their faces lie a few centimetres off the body, on either side.
+        # Annotators fit boxes to many scans of a car: their faces are a few centimetres off the body, on either side.
         slack = rng.uniform((-0.08, -0.04, -0.05), (0.12, 0.10, 0.06))
         profile = styles.draw_style(rng, length, height, van=name == "Van")
         dark = config.dark_paint_share if name == "Car" else 0.1
@@ -149,13 +149,13 @@ def body_of(target: Target, config: SceneConfig, rng: np.random.Generator) -> Pr
     most = float(rng.uniform(*config.warp_m))
     if name in ("Pedestrian", "Person_sitting", "Cyclist"):
         body = shape_noise.scaled(body, rng.uniform((0.94, 0.94, 0.98), (1.06, 1.06, 1.02)))
-        most *= 0.7  # of a person's size, waves as high as a car's would tear limbs apart
+        most *= 0.7  # for a person's size, waves as high as a car's would separate limbs
     body = shape_noise.warped(rng, body, most)
     if rng.random() < config.dark_patch_share:
         body = shape_noise.darkened(rng, body)
     dx, dy = rng.normal(0.0, config.box_offset_sigma_m, 2)
     if name in ("Pedestrian", "Person_sitting"):
-        # Annotators center a person's box on what they see, which is the side towards the sensor.
+        # Annotators center a person's box on the visible side, towards the sensor.
         behind = rng.normal(*config.person_behind_box_m) / max(float(np.hypot(x, y)), 1.0)
         dx, dy = dx + behind * x, dy + behind * y
     return body.placed(x + dx, y + dy, z - height / 2 - target.lift_m, yaw)
@@ -168,9 +168,9 @@ def build(
     within_rad: float,
     numbers: Sequence[int] | None = None,
 ) -> Bodies:
-    """Primitives of a scene.
+    """Return the primitives of a scene.
 
-    Objects whose azimuth is beyond `within_rad` of straight ahead are left out; the chance of the others does not
+    Objects whose azimuth is beyond `within_rad` of straight ahead are left out; the random numbers of the others do not
     change by that. An object's body depends on `seed` and on its number; `numbers` are 0, 1, 2 ... if not given.
     """
     parts, owners, salts, blob_owners, blob_salts = [scene.background], [], [], [], []

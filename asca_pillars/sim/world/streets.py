@@ -1,4 +1,4 @@
-"""Drawing a street: what kind, how wide, how steep, what lies beside its carriageway."""
+"""Random streets: kind, width, slopes, and surroundings of the carriageway."""
 
 from bisect import bisect_right
 from dataclasses import replace
@@ -35,17 +35,17 @@ STEEP_SHARE = {"rural": 0.35, "road": 0.3}
 
 
 def draw_kind(config: SceneConfig, rng: np.random.Generator) -> str:
-    """The kind of a street."""
+    """Draw the kind of a street."""
     shares = np.array([getattr(config, kind) for kind in KINDS])
     return KINDS[int(rng.choice(len(KINDS), p=shares / shares.sum()))]
 
 
 def draw_ground(config: SceneConfig, rng: np.random.Generator, kind: str) -> Ground:
-    """The ground of a street of that kind; the car stands in a lane at the origin."""
+    """Draw the ground of a street of that kind; the car is in a lane at the origin."""
     half = float(rng.uniform(*HALF_WIDTH_M[kind]))
     lanes = max(int(half // 3.1), 1)
     width = half / lanes
-    # The car keeps to a right-hand lane; the road's middle is then to its left.
+    # The car is in a right-hand lane; the road's middle is to its left.
     offset = (int(rng.integers(lanes)) + 0.5) * width + rng.normal(0.0, 0.25)
     junction = rng.random() < config.junction_share * (0.5 if kind == "road" else 1.0)
     kerb = 0.0 if rng.random() < 0.12 else float(rng.uniform(0.03, 0.17))
@@ -76,7 +76,7 @@ def draw_ground(config: SceneConfig, rng: np.random.Generator, kind: str) -> Gro
     reflectance = asphalt * of_asphalt + (0.0, 0.0, rng.uniform(0.22, 0.42), 0.0, 0.15, 0.0)
     slope = (rng.normal(*config.slope_x), rng.normal(*config.slope_y))
     low, high = config.relief_m
-    # Most streets are flat and some are hilly: the square of a uniform draw.
+    # Most streets are flat and some are hilly: the square of a uniform random number.
     amplitude = low + (high - low) * rng.random() ** 2
     relief = draw_relief(rng, slope, amplitude, street, rng.uniform(*config.bump_m))
     ground = Ground(street, relief, reflectance, 0.0)
@@ -85,12 +85,12 @@ def draw_ground(config: SceneConfig, rng: np.random.Generator, kind: str) -> Gro
 
 
 def _bank(config: SceneConfig, rng: np.random.Generator, steep: bool) -> float:
-    """Slope of the ground beyond the pavement: mostly slight, an embankment beside some roads out of town."""
+    """Draw the slope of the ground beyond the pavement: mostly slight, an embankment beside some roads out of town."""
     return float(rng.uniform(*config.embankment_slope) if steep else rng.normal(0.0, config.bank_slope_sigma))
 
 
 def _beside(config: SceneConfig, rng: np.random.Generator, kind: str, half: float) -> dict[str, float]:
-    """Tracks in the road or on a bed of ballast left of it, and a second carriageway beyond."""
+    """Draw tracks in the road or on a bed of ballast left of it, and a second carriageway beyond."""
     numbers = {"rails_v_m": NO_RAILS}
     divided = rng.random() < DIVIDED_SHARE.get(kind, 0.0)
     strip = float(rng.uniform(0.8, 4.0))
@@ -115,16 +115,16 @@ def _beside(config: SceneConfig, rng: np.random.Generator, kind: str, half: floa
 
 
 class ScalarDraws(np.random.Generator):
-    """NumPy's generator with the same numbers in the same order; single ones come in half of the time or less."""
+    """NumPy's generator with the same numbers in the same order, twice as fast for single ones."""
 
     def uniform(self, low: Any = 0.0, high: Any = 1.0, size: Any = None) -> Any:
-        """As of NumPy."""
+        """Draw as NumPy's `uniform`."""
         if size is None and isinstance(low, float) and isinstance(high, float) and low <= high:
             return low + (high - low) * self.random()
         return super().uniform(low, high, size)
 
     def choice(self, a: Any, size: Any = None, replace: bool = True, p: Any = None, axis: int = 0, **rest: Any) -> Any:  # type: ignore[override]
-        """As of NumPy, but one of a list or a tuple is that item itself."""
+        """Draw as NumPy's `choice`, but return one of a list or a tuple as that item itself."""
         if size is not None or not isinstance(a, int | list | tuple):
             return super().choice(a, size, replace, p, axis, **rest)
         number = a if isinstance(a, int) else len(a)
@@ -137,5 +137,5 @@ class ScalarDraws(np.random.Generator):
 
 
 def draws_of(*seed: int) -> ScalarDraws:
-    """The generator of numbers that name what it is for, as `np.random.default_rng(seed)` is."""
+    """Return the generator of a seed of several numbers, as `np.random.default_rng(seed)`."""
     return ScalarDraws(np.random.PCG64(seed))

@@ -1,4 +1,4 @@
-"""Trees, hedges, shrubs and woods: clusters of leaves with gaps between them, into which rays go."""
+"""Trees, hedges, shrubs and woods: clusters of leaves with gaps between them, which rays penetrate."""
 
 import math
 
@@ -7,18 +7,18 @@ import numpy as np
 from asca_pillars.geometry.arrays import Floats
 from asca_pillars.sim.world.builder import Builder, Stretch
 
-# Far clusters are larger and fewer, as no ray tells the difference.
+# Far clusters are larger and fewer, as rays cannot resolve them.
 FINEST, FINE_WITHIN_M, COARSER_PER_M = 0.75, 8.0, 0.033
 
 
 def coarseness(builder: Builder, along: float, across: float, cross: bool) -> float:
-    """Factor on the size of leaf clusters at a place, relative to those some 17 m away."""
+    """Return the factor on the size of leaf clusters at a position, relative to those some 17 m away."""
     x, y, _ = builder.to_lidar(along, across, cross)
     return FINEST + COARSER_PER_M * max(math.hypot(x, y) - FINE_WITHIN_M, 0.0)
 
 
 def hedge(builder: Builder, stretch: Stretch) -> None:
-    """A trimmed hedge, now and then with gaps or of a car's length only."""
+    """Add a trimmed hedge, sometimes with gaps or only of a car's length."""
     rng, cross = builder.rng, stretch.cross
     height, thick = float(rng.uniform(0.7, 2.8)), float(rng.uniform(0.5, 1.4))
     across = stretch.side * (stretch.away_m + thick / 2)
@@ -32,7 +32,7 @@ def hedge(builder: Builder, stretch: Stretch) -> None:
 
 
 def hedge_block(builder: Builder, along: float, across: float) -> None:
-    """A hedge cut to a block, as large as a car or a person."""
+    """Add a hedge cut to a block, as large as a car or a person."""
     rng = builder.rng
     length, width, height = rng.uniform(0.6, 4.5), rng.uniform(0.5, 1.8), rng.uniform(0.6, 2.0)
     if builder.reserve(along, across, float(length), float(width)):
@@ -63,14 +63,14 @@ def _leaves_of_hedge(
 
 
 def wood(builder: Builder, stretch: Stretch) -> None:
-    """The dense edge of a wood or an overgrown slope, as it closes most views in KITTI; trunks in front of it."""
+    """Add the dense edge of a wood or an overgrown slope, as in most views in KITTI; with trunks in front of it."""
     rng, side, cross = builder.rng, stretch.side, stretch.cross
     front = side * (stretch.away_m + 1.0)
     free = np.array([a for a in stretch.along(3.0) if builder.reserve(a, front, 2.9, 1.8, cross)])
     if not len(free):
         return
     coarse = coarseness(builder, stretch.middle_m, front, cross)
-    # Far woods count only as far as they rise above what stands before them.
+    # Far woods matter only as far as they are higher than objects before them.
     height = float(rng.uniform(2.6, 5.0)) + 1.2 * max(coarse - 1.0, 0.0)
     density = float(np.exp(rng.uniform(np.log(1.5), np.log(6.0))))
     radius = 0.36 * coarse
@@ -79,7 +79,7 @@ def wood(builder: Builder, stretch: Stretch) -> None:
     waves = 0.6 * np.sin(along * rng.uniform(0.3, 1.2) + rng.uniform(0.0, 6.0))
     away = stretch.away_m + 0.7 + waves + np.abs(rng.normal(0.0, 0.6, count))
     _clusters(builder, along, side * away, rng.uniform(0.1, height, count), radius, density, cross)
-    # Rays that come through meet the inside of the wood.
+    # Rays that come through hit the inside of the wood.
     deep = max(count // 6, 2)
     along = rng.choice(free, deep) + rng.uniform(-1.5, 1.5, deep)
     away = stretch.away_m + rng.uniform(2.0, 5.0, deep)
@@ -90,7 +90,7 @@ def wood(builder: Builder, stretch: Stretch) -> None:
 
 
 def overgrow(builder: Builder, stretch: Stretch) -> None:
-    """Patches of ivy and shrubs before, on and behind what lines a stretch: few fences in KITTI stand bare."""
+    """Add patches of ivy and shrubs before, on and behind the lining of a section, as on most fences in KITTI."""
     rng, side, cross = builder.rng, stretch.side, stretch.cross
     radius = 0.26 * coarseness(builder, stretch.middle_m, side * stretch.away_m, cross)
     for _ in range(1 + int(stretch.length_m / 8.0)):
@@ -99,7 +99,7 @@ def overgrow(builder: Builder, stretch: Stretch) -> None:
         if not builder.reserve(float(middle), side * (stretch.away_m - deep), 2 * long, deep, cross):
             continue
         count = max(int(2 * long * height * 0.5 / radius**2), 3)
-        # Thinner upward and to its ends.
+        # Thinner upward and towards its ends.
         along = middle + long * rng.normal(0.0, 0.5, count)
         away = stretch.away_m - deep * np.abs(rng.normal(0.0, 0.5, count)) + rng.uniform(0.0, 0.4, count)
         z = height * rng.random(count) ** 1.3
@@ -107,7 +107,7 @@ def overgrow(builder: Builder, stretch: Stretch) -> None:
 
 
 def wood_across(builder: Builder, along: float, half_width: float) -> None:
-    """A wood's edge across the road's direction, where the view ends."""
+    """Add a wood's edge across the road's direction, at its end."""
     rng = builder.rng
     places = np.arange(-half_width, half_width, 3.0)
     free = np.array([v for v in places if builder.reserve(along, float(v), 1.8, 2.9)])
@@ -132,12 +132,12 @@ def _clusters(
 def crown(
     builder: Builder, along: float, across: float, z: float, size: tuple[float, float], density: float, cross: bool
 ) -> None:
-    """Clusters of leaves about a middle z above the ground, within `size` (radius across, radius up)."""
+    """Add clusters of leaves about a middle z above the ground, within `size` (radius across, radius up)."""
     rng, (wide, tall) = builder.rng, size
     coarse = coarseness(builder, along, across, cross)
     count = max(int(rng.integers(20, 50) / coarse), 3)
     way = rng.normal(0.0, 1.0, (count, 3))
-    # Leaves grow where the light is: more of them outside than at the heart.
+    # Leaves grow towards the light: more of them outside than in the center.
     way *= rng.uniform(0.3, 1.0, (count, 1)) ** 0.5 / np.linalg.norm(way, axis=1, keepdims=True)
     radius = 0.23 * (wide + tall) / 2 * coarse**0.5
     up = z + tall * way[:, 2]
@@ -145,7 +145,7 @@ def crown(
 
 
 def trees(builder: Builder, stretch: Stretch) -> None:
-    """A row of trees, alike in their height, with some shrubs."""
+    """Add a row of trees of similar height, with some shrubs."""
     rng = builder.rng
     away, tall = stretch.away_m + rng.uniform(0.3, 2.0), float(rng.uniform(1.0, 5.0))
     for along in stretch.along(float(rng.uniform(3.5, 10.0))):
@@ -156,7 +156,7 @@ def trees(builder: Builder, stretch: Stretch) -> None:
 
 
 def tree(builder: Builder, along: float, across: float, cross: bool = False, tall_m: float | None = None) -> None:
-    """A trunk, often bare as high as a laser reaches, and a crown."""
+    """Add a trunk, mostly without branches up to the height of a laser, and a crown."""
     rng = builder.rng
     base = (float(rng.uniform(1.0, 5.0)) if tall_m is None else tall_m) * float(rng.uniform(0.85, 1.15))
     if not trunk(builder, along, across, base + 1.5, cross):
@@ -168,7 +168,7 @@ def tree(builder: Builder, along: float, across: float, cross: bool = False, tal
 
 
 def trunk(builder: Builder, along: float, across: float, height: float, cross: bool = False) -> bool:
-    """A stem, straight or leaning, of one to three boles; whether there was room for it."""
+    """Add a straight or leaning trunk of one to three stems; return whether there was room for it."""
     rng = builder.rng
     thick = rng.random() < builder.config.thick_trunks
     radius = float(rng.uniform(0.175, 0.30) if thick else np.exp(rng.uniform(np.log(0.06), np.log(0.40))))
@@ -202,7 +202,7 @@ def trunk(builder: Builder, along: float, across: float, height: float, cross: b
 
 
 def shrub(builder: Builder, along: float, across: float, cross: bool = False, tall: bool = False) -> None:
-    """A bush from the ground up: round, or a column the size of a person."""
+    """Add a bush from the ground up: round, or a column the size of a person."""
     rng = builder.rng
     column = rng.random() < 0.25
     if column:
@@ -216,7 +216,7 @@ def shrub(builder: Builder, along: float, across: float, cross: bool = False, ta
 
 
 def weeds(builder: Builder, along: float, across: float) -> None:
-    """Tufts of grass, weeds and leaves, knee-high at most, along a kerb or anywhere."""
+    """Add tufts of grass, weeds and leaves, knee-high at most, along a kerb or anywhere."""
     rng = builder.rng
     long, wide = float(rng.uniform(0.3, 4.0)), float(rng.uniform(0.2, 0.9))
     if builder.reserve(along, across, long, wide):
@@ -228,14 +228,14 @@ def weeds(builder: Builder, along: float, across: float) -> None:
 
 
 def bush(builder: Builder, along: float, across: float) -> None:
-    """A bush or a clump of them as large as a car, broad at the foot or at the top."""
+    """Add a bush or a clump of them as large as a car, broad at the bottom or at the top."""
     rng = builder.rng
     long, wide, height = float(rng.uniform(0.7, 2.3)), float(rng.uniform(0.6, 1.3)), float(rng.uniform(0.9, 2.6))
     if not builder.reserve(along, across, 1.8 * long, 1.8 * wide):
         return
     count = int(30 * long * wide * height**0.5)
     up = rng.random(count)
-    shape = float(rng.uniform(-0.7, 0.7))  # how much broader its top is than its foot
+    shape = float(rng.uniform(-0.7, 0.7))  # width of its top relative to its bottom
     spread = np.sqrt(rng.random(count)) * np.clip(1.0 + shape * (up - 0.5), 0.2, 1.5)
     way = rng.uniform(0.0, 2 * np.pi, count)
     places = along + 0.85 * long * spread * np.cos(way), across + 0.85 * wide * spread * np.sin(way)
