@@ -41,7 +41,7 @@ def simulate(
             "--bundle",
             "-b",
             help="With --like: also compare the scores that this bundle (or checkpoint) gives to real objects and "
-            "their look-alikes, and how often it fires at what has no label.",
+            "the simulated ones paired with them, and its false positives per frame.",
             rich_help_panel="Input",
         ),
     ] = None,
@@ -124,7 +124,7 @@ def simulate(
     ] = 2,
     cluster: ClusterOption = None,
 ) -> None:
-    """Write simulated street scans with labels in KITTI's layout, and say how like real ones they are.
+    """Write simulated street scans with labels in KITTI's layout, and compare them with real ones.
 
     With --report or --like, a folder that holds scans already, simulated or real, is compared as it is unless --frames
     is given.
