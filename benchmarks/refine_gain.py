@@ -104,7 +104,7 @@ def _pv_rcnn(bundle: Path, frames: KittiSplit) -> tuple[dict[str, Judged], PostP
             nothing = np.empty(0, np.float32)
             found[frame_id] = Detections.empty(pipeline.spec.class_names), (nothing, nothing.reshape(0, 7))
             continue
-        proposals, logits, residuals = pipeline.judge(raw.maps, raw, [])
+        proposals, logits, residuals = pipeline.propose_and_refine(raw.maps, raw, [])
         found[frame_id] = proposals, (logits, residuals)
     return found, pipeline.spec.post, f"{detector.bundle.name}, {detector.runs_on}"
 

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from asca_deploy.around import ranges_around, turns_around, widened
+from asca_deploy.around import ranges_around, turns_around, widen_ranges
 from asca_deploy.detect_scans import repairs_of
 from asca_deploy.detector import usable_points
 from asca_deploy.manifest import load_bundle
@@ -132,7 +132,7 @@ def inspect_scans(
         AscaError: the bundle or an option cannot be used.
     """
     path, manifest = Path(path), load_bundle(find_bundle(bundle))
-    model = widened(manifest) if around else manifest
+    model = widen_ranges(manifest) if around else manifest
     ranges, expected = model.spec.ranges, model.expected_input
     if around:
         ranges = ranges_around(ranges, len(turns_around(ranges, camera_view=expected.camera_view)))

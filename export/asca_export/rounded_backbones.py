@@ -138,10 +138,10 @@ class _RoundedSparse:
 
 
 def _sample(detector: PillarDetector, encoded: Encoded) -> SparseSample:
-    tables = detector.preparation.place(encoded.pillars).tables
-    assert tables is not None
+    rulebooks = detector.preparation.place(encoded.pillars).rulebooks
+    assert rulebooks is not None
     features, _ = pool_pillars(encoded.features, encoded.pillars.cells, detector.grid)
-    return SparseSample(torch.from_numpy(features), tree_map_only(np.ndarray, torch.from_numpy, tables))
+    return SparseSample(torch.from_numpy(features), tree_map_only(np.ndarray, torch.from_numpy, rulebooks))
 
 
 OP_TYPES = ["Conv", "MatMul", "Relu", "Transpose", "Reshape", "Concat"]

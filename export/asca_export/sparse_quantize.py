@@ -26,7 +26,7 @@ class SparseSample(NamedTuple):
 
     features: Tensor
     """(P, C) pillar features."""
-    tables: NeckRulebooks[Tensor]
+    rulebooks: NeckRulebooks[Tensor]
 
     def in_steps(self, steps: CanvasSteps) -> "SparseSample":
         """Return the sample with features rounded to whole steps, times STEP_VALUE."""

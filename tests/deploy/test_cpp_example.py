@@ -104,8 +104,8 @@ def test_tables_are_those_of_python(build_tables: Path, rule: MaskRule) -> None:
     answer = subprocess.run([build_tables, str(ny), str(nx), rule], input=given, check=True, capture_output=True)
     values = np.frombuffer(answer.stdout, np.int32)
     for cells in scans:
-        tables = NeckRulebookBuilder(ny, nx, rule).build(cells)
-        expected = {**rulebook_inputs(tables), "head_cells": tables.head_cells}
+        rulebooks = NeckRulebookBuilder(ny, nx, rule).build(cells)
+        expected = {**rulebook_inputs(rulebooks), "head_cells": rulebooks.head_cells}
         for name, table in expected.items():
             if name.startswith("first") and (rule, name) != ("fine", "first_0"):
                 table = table[:0]  # where nothing grows a graph reads `same`

@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from asca_deploy import Detector
-from asca_deploy.pillar.pipeline import CanvasBackbone, PillarPipeline
+from asca_deploy.pillar.pipeline import DenseBackbone, PillarPipeline
 from asca_deploy.stream import overlapped
 from asca_pillars.base.errors import ScanError
 from tests.deploy.conftest import make_scan
@@ -153,7 +153,7 @@ def test_nothing_grows_with_the_number_of_scans(tiny_bundle: Path, monkeypatch: 
     images: set[int] = set()
     assert isinstance(detector.pipeline, PillarPipeline)
     backbone = detector.pipeline.backbone
-    assert isinstance(backbone, CanvasBackbone)
+    assert isinstance(backbone, DenseBackbone)
     neck_and_head = backbone.neck_and_head
     monkeypatch.setattr(backbone, "neck_and_head", lambda image: images.add(image.ctypes.data) or neck_and_head(image))
     most_threads = 0

@@ -33,7 +33,7 @@ from asca_pillars.models.two_stage.preparation import (
 )
 from asca_pillars.models.two_stage.sets import SetAbstraction
 from asca_pillars.ops.two_stage.decode import Scores, refined_detections, refined_scores, reported_frames
-from asca_pillars.ops.two_stage.first_stage import Proposed
+from asca_pillars.ops.two_stage.first_stage import SecondStageInputs
 from asca_pillars.ops.two_stage.prepare import ROI_FEATURES, RefineSettings, refine_scan
 
 POINT_CHANNELS = 1  # reflectance
@@ -142,7 +142,7 @@ def build_refiner(bev_channels: int, classes: int, refine: RefineConfig) -> Pill
 def refine(
     network: PillarRefiner,
     points: NDArray[np.float32],
-    proposed: Proposed,
+    proposed: SecondStageInputs,
     settings: RefineSettings,
     post: PostProcess,
     scores: Scores,
@@ -160,7 +160,7 @@ def refine(
 
 
 def refine_logits(
-    network: PillarRefiner, points: NDArray[np.float32], proposed: Proposed, settings: RefineSettings
+    network: PillarRefiner, points: NDArray[np.float32], proposed: SecondStageInputs, settings: RefineSettings
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return confidence logits (R,) and residuals (R, 7) of the proposals of one scan, see `refine`."""
     if not len(proposed.proposals):

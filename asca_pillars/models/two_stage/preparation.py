@@ -22,7 +22,7 @@ from asca_pillars.models.two_stage.first_stage import open_first_stage, with_fir
 from asca_pillars.models.two_stage.layers import RefineInputs
 from asca_pillars.models.two_stage.loss import RefineTargets
 from asca_pillars.models.two_stage.proposal_cache import ProposalCache, ProposalFiles
-from asca_pillars.ops.two_stage.first_stage import FirstStage, FirstStageSettings, Proposed, propose_on
+from asca_pillars.ops.two_stage.first_stage import FirstStage, FirstStageSettings, SecondStageInputs, run_first_stage
 from asca_pillars.ops.two_stage.prepare import RefineScan, RefineSettings, refine_scan
 from asca_pillars.ops.two_stage.rois import (
     Overlaps,
@@ -54,7 +54,7 @@ class RefineBatch(NamedTuple):
 
 def sample_of(
     frame: LabeledFrame,
-    proposed: Proposed,
+    proposed: SecondStageInputs,
     overlaps: Overlaps,
     rows: NDArray[np.int64],
     settings: RefineSettings,
@@ -146,7 +146,7 @@ class LabeledProposals(NamedTuple):
 class ProposalSource(Protocol):
     """Source of a frame's proposals."""
 
-    def __call__(self, frame: LabeledFrame) -> Proposed:
+    def __call__(self, frame: LabeledFrame) -> SecondStageInputs:
         """Return the first-stage results of the frame in its current, perhaps augmented, state."""
         ...
 
@@ -157,7 +157,7 @@ class CachedProposals:
 
     files: ProposalFiles
 
-    def __call__(self, frame: LabeledFrame) -> Proposed:
+    def __call__(self, frame: LabeledFrame) -> SecondStageInputs:
         """See `ProposalSource`."""
         return move_proposed(self.files.read(frame.frame_id), frame.motion)
 
@@ -169,9 +169,9 @@ class LiveProposals:
     stage: FirstStage
     settings: FirstStageSettings
 
-    def __call__(self, frame: LabeledFrame) -> Proposed:
+    def __call__(self, frame: LabeledFrame) -> SecondStageInputs:
         """See `ProposalSource`."""
-        return propose_on(self.stage, frame.points, self.settings)
+        return run_first_stage(self.stage, frame.points, self.settings)
 
 
 @dataclass(frozen=True)
@@ -224,7 +224,7 @@ def live_preparation(model: RefineModel) -> RefinePreparation:
     return RefinePreparation(model.refine, LiveProposals(open_first_stage(model.first_stage), model.refine.seen))
 
 
-def move_proposed(proposed: Proposed, motion: Motion) -> Proposed:
+def move_proposed(proposed: SecondStageInputs, motion: Motion) -> SecondStageInputs:
     """Move proposals and keypoints with the augmented scene; map features of keypoints stay."""
     proposals = proposed.proposals
     moved = LabeledFrame("", proposed.keypoints.copy(), proposals.boxes.copy(), proposals.labels)

@@ -214,15 +214,15 @@ def join(convolution: Convolution, source: CellMap, target: CellMap) -> Join:
     return Join(source, target, inputs, convolution.outputs(source.shape, target.shape))
 
 
-def stack_rows(tables: Sequence[NDArray[np.int32]], rows: Sequence[int]) -> NDArray[np.int32]:
-    """Stack tables (M_i, ...) of indices into features of `rows[i]` rows -> one into all of them, (sum of M_i, ...).
+def stack_rows(rulebooks: Sequence[NDArray[np.int32]], rows: Sequence[int]) -> NDArray[np.int32]:
+    """Stack rulebooks (M_i, ...) of indices into features of `rows[i]` rows -> one into all of them, (sum of M_i, ...).
 
     The index of a missing row, rows[i], becomes sum(rows).
     """
     starts, total = np.concatenate([[0], np.cumsum(rows)]).astype(np.int32), sum(rows)
     moved = [
         np.where(table == count, np.int32(total), table + start)
-        for table, count, start in zip(tables, rows, starts[:-1], strict=True)
+        for table, count, start in zip(rulebooks, rows, starts[:-1], strict=True)
     ]
     return np.concatenate(moved)
 

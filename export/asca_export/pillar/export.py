@@ -83,5 +83,5 @@ def _export_graphs(
         return graphs.multiply_accumulates(path) / 1e9
     backbone = SparseBackbone(detector)
     export_sparse_backbone(backbone, path)
-    tables = [preparation.place(preparation.spec.pillarize(scan)).tables for scan in scans]
-    return float(np.mean([sparse_multiply_accumulates(backbone, each) for each in tables if each is not None])) / 1e9
+    rulebooks = [preparation.place(preparation.spec.pillarize(scan)).rulebooks for scan in scans]
+    return float(np.mean([sparse_multiply_accumulates(backbone, each) for each in rulebooks if each is not None])) / 1e9

@@ -19,7 +19,7 @@ from asca_pillars.base.errors import ExportError
 from asca_pillars.base.files import WEIGHTS_FILE
 from asca_pillars.detection.spec import DetectorSpec
 from asca_pillars.models.two_stage.first_stage import open_first_stage
-from asca_pillars.ops.two_stage.first_stage import FirstPass, FirstStage, require_pillar_kind
+from asca_pillars.ops.two_stage.first_stage import FirstStage, FirstStageOutputs, require_pillar_kind
 
 
 def add_neck_output(backbone: onnx.ModelProto) -> onnx.ModelProto:
@@ -151,7 +151,7 @@ class BundleFirstStage:
         bundle, threads, precision = self._source
         return partial(BundleFirstStage, threads=threads, precision=precision), (bundle,)
 
-    def __call__(self, points: NDArray[np.float32]) -> FirstPass:
+    def __call__(self, points: NDArray[np.float32]) -> FirstStageOutputs:
         """See `FirstStage`."""
         pillars = self._pipeline.pillarize(points)
         return self._backbone.infer_with_neck(self._backbone.place(self._pipeline.encode(pillars), pillars.cells))

@@ -181,9 +181,9 @@ def test_steps_change_nothing_before_they_are_rounded() -> None:
     samples = []
     for seed in (1, 2):
         scans = batch(detector, frame(seed)).scans
-        tables = {f"same_{number}": level.same for number, level in enumerate(scans.levels[:-1])}
-        tables |= {f"strided_{number}": level.strided for number, level in enumerate(scans.levels) if number}
-        samples.append(VoxelSample(scans.features, tables))
+        rulebooks = {f"same_{number}": level.same for number, level in enumerate(scans.levels[:-1])}
+        rulebooks |= {f"strided_{number}": level.strided for number, level in enumerate(scans.levels) if number}
+        samples.append(VoxelSample(scans.features, rulebooks))
         with torch.inference_mode():
             wanted = detector.network.voxels(scans.features, scans.levels)
     products = VoxelProducts(detector.network.voxels)

@@ -20,7 +20,12 @@ from asca_pillars.base.errors import BundleError, ConfigError, ExportError
 from asca_pillars.detection.proposals import ProposalSettings
 from asca_pillars.models.pillar.network import PillarDetector
 from asca_pillars.models.two_stage.first_stage import open_first_stage, with_first_stage
-from asca_pillars.ops.two_stage.first_stage import FirstPass, FirstStageSettings, proposed_from, require_pillar_kind
+from asca_pillars.ops.two_stage.first_stage import (
+    FirstStageOutputs,
+    FirstStageSettings,
+    require_pillar_kind,
+    second_stage_inputs,
+)
 from tests.export.tiny import CALIBRATION, NETWORK, SCANS, tiny_checkpoint
 from tests.helpers.saved_checkpoint import save_checkpoint
 from tests.helpers.scenes import SPEC
@@ -98,8 +103,8 @@ def test_rows_of_active_cells_are_a_map_with_zeros_beside_them(tmp_path: Path) -
         whole[:, rows.cells] = part.T
     whole_maps = type(rows.maps)(*(part.reshape(-1, height, width) for part in maps))
     settings = FirstStageSettings(ProposalSettings(score_threshold=0.0))
-    wanted = proposed_from(FirstPass(whole_maps, neck.reshape(height, width, -1)), points, SPEC, settings)
-    found = proposed_from(rows, points, SPEC, settings)
+    wanted = second_stage_inputs(FirstStageOutputs(whole_maps, neck.reshape(height, width, -1)), points, SPEC, settings)
+    found = second_stage_inputs(rows, points, SPEC, settings)
     assert len(found.proposals) and len(found.keypoints) and 0 < len(rows.cells) < height * width
     np.testing.assert_array_equal(found.proposals.boxes, wanted.proposals.boxes)
     np.testing.assert_array_equal(found.bev, wanted.bev)
