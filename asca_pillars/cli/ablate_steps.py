@@ -138,7 +138,7 @@ def check(variants: Sequence[Row], config: str, overrides: Sequence[str], data: 
             proven on.
     """
     from asca_deploy.shipped import find_checkpoint
-    from asca_export.proven_bundle import MIN_SCANS
+    from asca_export.bundle_writer import MIN_SCANS
     from asca_pillars.training.checkpoints import initial_weights
 
     base = load_config(config, overrides)
@@ -168,8 +168,8 @@ def time_variants(todo: Sequence[Run], family: Family, split: KittiSplit, consol
     """Export one checkpoint of every variant and time them in alternation on the same scans."""
     from asca_deploy import Detector
     from asca_deploy.benchmark import alternate
+    from asca_export.bundle_writer import MIN_SCANS
     from asca_export.export import export_bundle
-    from asca_export.proven_bundle import MIN_SCANS
     from asca_pillars.data.frames import read_frame
     from asca_pillars.models.checkpoint import load_checkpoint
 

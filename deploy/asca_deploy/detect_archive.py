@@ -174,7 +174,7 @@ def detect_archive(
     is_run = json_object("shard_size", "settings")
     claim(out, {f"{SHARDS}/{RUN_SETTINGS}": is_run})
     require_own(out / SHARDS, COMMAND, {RUN_SETTINGS: is_run})
-    for line in scan_input.said:
+    for line in scan_input.notes:
         reporter.remark(line)
     job = _job(scan_input.mounting, reading.columns, options, out, score=score, around=around)
     folder = ShardFolder(job.shards)

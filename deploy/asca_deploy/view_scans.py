@@ -71,7 +71,7 @@ class ScanServer:
     Attributes:
         address: where the page is.
         names: of the scans, in the order in which the page shows them.
-        said: sentences about what was decided for the scans.
+        notes: sentences about what was decided for the scans.
 
     Raises:
         ScanError: there are no scans, or the first cannot be read.
@@ -100,8 +100,8 @@ class ScanServer:
         lowest = {name: min(value, LOWEST_SCORE) if detector.passes == 1 else value for name, value in shown.items()}
         detector.spec = detector.pipeline.spec = detector.spec.with_score_threshold(lowest)
         self.names = [scan.name.as_posix() + scan.path.suffix for scan in named]
-        self.said = tuple(scan_input.said)
-        answers = _Answers(paths, scan_input, detector, around=around)
+        self.notes = tuple(scan_input.notes)
+        answers = _ScanContents(paths, scan_input, detector, around=around)
         answers.boxes(0)  # errors that concern all scans are raised before the page opens
         files = {f"/{file.name}": file.read_bytes() for file in page_modules()}
         files["/"] = files["/index.html"]
@@ -152,7 +152,7 @@ class _Server(ThreadingHTTPServer):
     daemon_threads = True  # a browser's open connection does not hold up the end
 
 
-class _Answers:
+class _ScanContents:
     """Points and boxes of scans by their number; requests are handled one at a time."""
 
     def __init__(self, paths: Sequence[Path], scan_input: ScanInput, detector: Detector, *, around: bool) -> None:

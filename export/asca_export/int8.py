@@ -17,7 +17,7 @@ from asca_deploy.pillar.pipeline import PillarPipeline, open_backbone
 from asca_export import graphs
 from asca_export.parity import COMPARED_ANCHORS, by_class
 from asca_export.quantize import canvas_steps
-from asca_export.rounded_backbones import Encoded, quantize_encoder, round_backbone
+from asca_export.rounded_backbones import EncodedScan, quantize_encoder, round_backbone
 from asca_pillars.base.errors import ExportError
 from asca_pillars.detection.detections import Detections
 from asca_pillars.geometry.overlap import bev_iou
@@ -128,7 +128,7 @@ def quantize_bundle(
         def error_of(eight_bit: Sequence[str]) -> float:
             rounded.write(trial, eight_bit)
             backbone = open_backbone(trial, eight_bit_form, "cpu", "float32", runtime.threads)
-            placed = (backbone.place(each.in_steps(steps), each.pillars.cells) for each in compared)
+            placed = (backbone.place(each.quantize_features(steps), each.pillars.cells) for each in compared)
             found = (backbone.run(each).maps.scores for each in placed)
             return logit_error(expected, found, bundle.spec)
 
@@ -193,8 +193,8 @@ def sweep(
 
 def _with_boxes(report: Quantization, expected: Sequence[Detections], found: Sequence[Detections]) -> Quantization:
     """Return the report with the boxes that the 8-bit bundle finds again, and those that it alone finds."""
-    matched = sum(map(_partnered, expected, found))
-    added = sum(map(len, found)) - sum(map(_partnered, found, expected))
+    matched = sum(map(_count_matches, expected, found))
+    added = sum(map(len, found)) - sum(map(_count_matches, found, expected))
     return replace(report, boxes_matched=matched, boxes_added=added)
 
 
@@ -202,9 +202,9 @@ def _digest(points: Points) -> bytes:
     return hashlib.sha256(points.tobytes()).digest()
 
 
-def _encode(pipeline: PillarPipeline, points: Points) -> Encoded:
+def _encode(pipeline: PillarPipeline, points: Points) -> EncodedScan:
     pillars = pipeline.pillarize(points)
-    return Encoded(pipeline.encode(pillars), pillars)
+    return EncodedScan(pipeline.encode(pillars), pillars)
 
 
 def logit_error(
@@ -220,7 +220,7 @@ def logit_error(
     return float(np.sqrt(np.mean(squares)))
 
 
-def _partnered(boxes: Detections, others: Detections) -> int:
+def _count_matches(boxes: Detections, others: Detections) -> int:
     """Return the number of boxes that match one of the others."""
     same = boxes.labels[:, None] == others.labels[None]
     return int(((bev_iou(boxes.boxes, others.boxes) >= SAME_IOU) & same).any(axis=1).sum())

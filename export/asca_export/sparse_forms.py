@@ -155,7 +155,7 @@ def export_sparse_backbone(
     """
     graph, maps = RowGraph(backbone.product, eight_bit), []
     row_type = np.dtype(np.uint8 if steps else np.float32)
-    rows = graph.take(PILLAR_FEATURES, helper.np_dtype_to_tensor_dtype(row_type), "pillars", backbone.channels)
+    rows = graph.add_input(PILLAR_FEATURES, helper.np_dtype_to_tensor_dtype(row_type), "pillars", backbone.channels)
     missing = backbone.empty.numpy().astype(row_type)
     for level in backbone.levels:
         for layer in level.convolutions:
@@ -171,7 +171,7 @@ def export_sparse_backbone(
     sizes = graph.constant(HEAD, "channels", np.array(backbone.head_channels, np.int64))
     graph.named("Split", HeadMaps._fields, outputs, sizes, axis=1)
     for name, channels in zip(HeadMaps._fields, backbone.head_channels, strict=True):
-        graph.give(name, TensorProto.FLOAT, "head_cells", channels)
+        graph.add_output(name, TensorProto.FLOAT, "head_cells", channels)
     graph.save(path, "sparse_backbone")
 
 
@@ -195,7 +195,7 @@ def _joined(graph: RowGraph, maps: Sequence[str], places: Sequence[str], missing
     rows, indices, first = [], [], ""
     for number, (values, place) in enumerate(zip(maps, places, strict=True)):
         owner = f"head{number}"
-        graph.take(place, TensorProto.INT32, "head_cells")
+        graph.add_input(place, TensorProto.INT32, "head_cells")
         rows += [values, graph.constant(owner, "missing", missing)]
         if number:
             size = graph.node("Shape", owner, "size", maps[number - 1], start=0, end=1)

@@ -28,7 +28,7 @@ class SparseSample(NamedTuple):
     """(P, C) pillar features."""
     rulebooks: NeckRulebooks[Tensor]
 
-    def in_steps(self, steps: CanvasSteps) -> "SparseSample":
+    def quantize_features(self, steps: CanvasSteps) -> "SparseSample":
         """Return the sample with features rounded to whole steps, times STEP_VALUE."""
         whole = (self.features / steps.scale + steps.empty).round().clamp(0, STEPS)
         return self._replace(features=whole * STEP_VALUE)

@@ -51,8 +51,8 @@ def test_a_line_for_each_scan_with_its_time(drive: Path, tmp_path: Path, capsys:
     ranges_m = [list(spec.ranges.x_m), list(spec.ranges.y_m)]
     assert [line["detector"] for line in lines] == [{"classes": list(spec.class_names), "ranges_m": ranges_m}] * SCANS
     assert {path.name for path in tmp_path.iterdir()} == {"detections.jsonl", "recording.json"}
-    said = capsys.readouterr().out
-    assert "/lidar: 5 scans" in said and "ms of CPU per scan" in said
+    output = capsys.readouterr().out
+    assert "/lidar: 5 scans" in output and "ms of CPU per scan" in output
     # The same boxes as of the scan alone.
     np.save(tmp_path / "scan.npy", POINTS)
     detect([tmp_path / "scan.npy"], out=tmp_path / "alone", threads=1, pictures=False)

@@ -181,7 +181,7 @@ def test_mistakes_are_one_line(detect: Path, tiny_bundle: Path, tmp_path: Path) 
         spec = manifest["spec"]
         spec[key] = {**spec[key], **value} if isinstance(value, dict) else value
         (folder / "bundle.json").write_text(json.dumps(manifest))
-    for arguments, said in (
+    for arguments, message in (
         ([tmp_path, sample_scan_path()], "bundle.json: cannot be read"),
         ([pooled, sample_scan_path()], "pooled: needs schema 3, kind pillar and a warped map"),
         ([every, sample_scan_path()], "every: needs anchors at cell centers with one score for each"),
@@ -190,4 +190,4 @@ def test_mistakes_are_one_line(detect: Path, tiny_bundle: Path, tmp_path: Path) 
     ):
         result = subprocess.run([detect, *arguments], capture_output=True, text=True)
         assert result.returncode == 2
-        assert said in result.stderr and result.stderr.count("\n") == 1
+        assert message in result.stderr and result.stderr.count("\n") == 1

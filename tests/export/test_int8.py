@@ -16,8 +16,8 @@ from asca_deploy.bundle import PillarBundle
 from asca_deploy.manifest import load_pillar_bundle
 from asca_deploy.pillar.pipeline import DenseBackbone, PillarPipeline
 from asca_export import graphs, int8
+from asca_export.bundle_writer import ExportOptions
 from asca_export.pillar.export import export_pillar_bundle
-from asca_export.proven_bundle import ExportOptions
 from asca_pillars.base.errors import ExportError
 from asca_pillars.config.pillar import CpaReading
 from asca_pillars.config.tree import pillar_spec

@@ -63,7 +63,7 @@ def sample_of(detector: PillarDetector, pillars: Pillars) -> SparseSample:
 
 def quantized_backbone(detector: PillarDetector, samples: Sequence[SparseSample], steps: CanvasSteps) -> SparseBackbone:
     """Every row in steps and every weight on the grid of 8-bit arithmetic, from real values of scans with pillars."""
-    backbone, counted = SparseBackbone(detector, steps), [sample.in_steps(steps) for sample in samples]
+    backbone, counted = SparseBackbone(detector, steps), [sample.quantize_features(steps) for sample in samples]
     scale_rows_to_steps(backbone, counted)
     round_products(backbone, list(backbone.products), read_moments(backbone, counted))
     return backbone
@@ -123,7 +123,7 @@ def test_eight_bits_are_near_and_the_same_for_any_number_of_threads(tmp_path: Pa
     samples = [sample_of(detector, SPEC.pillarize(points)) for points in SCANS]
     steps = canvas_steps(sample.features.numpy() for sample in samples)
     backbone = SparseBackbone(detector, steps)
-    counted = [sample.in_steps(steps) for sample in samples]
+    counted = [sample.quantize_features(steps) for sample in samples]
     scale_rows_to_steps(backbone, counted)
     with torch.inference_mode():  # scaled, it is still the same function
         exact = SparseBackbone(detector)(*samples[0]).scores

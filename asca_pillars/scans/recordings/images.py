@@ -97,12 +97,12 @@ class NearestImages:
         """Sentences about what was left out; to be asked for at the end."""
         if self.topic is None:
             return []
-        said = []
+        notes = []
         if self.unreadable:
-            said.append(f"{self.topic.name}: {self.unreadable} images were left out: {self.trouble}")
+            notes.append(f"{self.topic.name}: {self.unreadable} images were left out: {self.trouble}")
         if not self.shown:
-            said.append(f"{self.topic.name}: no image is within {IMAGE_REACH_NS / 1e9:g} s of a scan")
-        return said
+            notes.append(f"{self.topic.name}: no image is within {IMAGE_REACH_NS / 1e9:g} s of a scan")
+        return notes
 
     def _read(self) -> Iterator[CameraImage]:
         if self.topic is None:

@@ -49,8 +49,8 @@ def read_point_cloud(message: Message, source: str, kind: ScanKind = "PointCloud
         raise ScanError(f"{source}: no readable {name} ({reason(error)}); record it again") from None
     time_ns = time_of(header, message)
     if time_ns is None:
-        said = "neither the header nor the recording has a usable time stamp, it was taken as 0"
-        points, time_ns = points._replace(remarks=(*points.remarks, said)), 0
+        note = "neither the header nor the recording has a usable time stamp, it was taken as 0"
+        points, time_ns = points._replace(remarks=(*points.remarks, note)), 0
     return PointCloud(points, time_ns, str(header.frame_id), fields)
 
 

@@ -19,13 +19,13 @@ from asca_deploy.detector import Detector
 from asca_deploy.open_model import RuntimeOptions, open_detector, track_thresholds
 from asca_deploy.recordings.journal import JOURNAL_FILE, Journal, ScanResult, is_journal
 from asca_deploy.recordings.results import (
-    Found,
+    FrameResult,
     JsonLines,
     KittiTracks,
     ResultFile,
     open_text,
-    said_of_stamps,
-    tracked,
+    timestamp_note,
+    track_results,
 )
 from asca_deploy.recordings.sequence_files import SequenceFiles
 from asca_deploy.result_files import ABOUT_FILE, KITTI_FILE, RUN_FILE, claim, remove_companions
@@ -205,7 +205,7 @@ def _detect(task: _Task, reading: ScanSettings, options: RuntimeOptions, reporte
         if task.track:
             _check_times(times_ns, task, topic.name, poses, reporter)
         pose_at = None if poses is None else partial(_pose_of_scan, poses, mounting)
-        results = _with_points(tracked(journal, tracker, pose_at), scans if task.files.show_points else None)
+        results = _with_points(track_results(journal, tracker, pose_at), scans if task.files.show_points else None)
         opened = partial(task.files.open, detector=detector, times_ns=times_ns, pose_at=pose_at, images=images)
         scope = detector_scope(detector.spec, around=task.around)
         written, classes = _write(task, results, calibration, scope, about, opened)
@@ -280,7 +280,7 @@ class _Run:
 
 def _check_times(times: Sequence[int], task: _Task, topic: str, poses: Poses | None, reporter: Reporter) -> None:
     """Report stamps out of order or too short odometry; ScanError if the odometry is of another time."""
-    if stamps := said_of_stamps(times):
+    if stamps := timestamp_note(times):
         reporter.remark(f"{task.path}, {topic}: {stamps}")
     if poses is None:
         return
@@ -329,8 +329,8 @@ def _pose_of_scan(poses: Poses, mounting: Mounting, time_ns: int) -> NDArray[np.
 
 
 def _with_points(
-    results: Iterator[Found], scans: RecordedScans | None
-) -> Iterator[tuple[Found, NDArray[np.float32] | None]]:
+    results: Iterator[FrameResult], scans: RecordedScans | None
+) -> Iterator[tuple[FrameResult, NDArray[np.float32] | None]]:
     """Yield each result with the points of its scan, which is read once more; None without `scans`."""
     again = iter(()) if scans is None else scans.read()
     for found in results:
@@ -340,7 +340,7 @@ def _with_points(
 
 def _write(
     task: _Task,
-    results: Iterator[tuple[Found, NDArray[np.float32] | None]],
+    results: Iterator[tuple[FrameResult, NDArray[np.float32] | None]],
     calibration: Any,
     scope: DetectorScope,
     about: dict[str, Any],

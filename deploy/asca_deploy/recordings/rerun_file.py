@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from asca_deploy.recordings.results import Found
+from asca_deploy.recordings.results import FrameResult
 from asca_pillars.pictures.colors import class_rgb, ground_height, height_rgb
 from asca_pillars.scans.recordings.images import CameraImage, NearestImages
 
@@ -52,7 +52,7 @@ class RerunFile:
         self._failed = False
         self._ground_m: float | None = None
 
-    def write(self, found: Found, points: NDArray[np.float32] | None) -> None:
+    def write(self, found: FrameResult, points: NDArray[np.float32] | None) -> None:
         """Write one scan with its boxes."""
         assert points is not None, "it shows points"
         rr, stream = self._rr, self._stream
@@ -108,7 +108,7 @@ class RerunFile:
         else:
             self._stream.log(_CAMERA, self._rr.Image(image.content, color_model=image.kind))
 
-    def _velocities(self, found: Found) -> Any:
+    def _velocities(self, found: FrameResult) -> Any:
         """Return an arrow for each moving track, as long as its way of one second, from the center of its roof."""
         assert found.tracks is not None
         moving = np.hypot(*found.tracks.velocities_mps.T) > MOVES_MPS
@@ -120,10 +120,10 @@ class RerunFile:
             radii=0.06,
         )
 
-    def _colors(self, found: Found) -> NDArray[np.uint8]:
+    def _colors(self, found: FrameResult) -> NDArray[np.uint8]:
         return np.array([class_rgb(name) for name in found.detections.names], np.uint8).reshape(-1, 3)
 
-    def _boxes(self, found: Found) -> Any:
+    def _boxes(self, found: FrameResult) -> Any:
         rr, boxes = self._rr, found.detections.boxes
         half: NDArray[np.float64] = boxes[:, 6].astype(np.float64) / 2
         quaternions = np.stack([0 * half, 0 * half, np.sin(half), np.cos(half)], axis=1)

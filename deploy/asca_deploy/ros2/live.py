@@ -43,7 +43,7 @@ class _Taken:
     at_s: float
 
 
-class Live:
+class LiveDetection:
     """Live detection: a queue that one thread fills with clouds, and a detector that another runs (`run`).
 
     Args:
@@ -94,10 +94,10 @@ class Live:
         """Name of the model."""
         return self._detector.bundle.name
 
-    def take(self, cloud: Any) -> None:
+    def enqueue(self, cloud: Any) -> None:
         """Enqueue a `sensor_msgs/PointCloud2`, or an object like it; a full queue drops its oldest scan."""
         at_s = monotonic()
-        self.health.take()
+        self.health.count_received()
         stamp = stamp_of(cloud.header)
         try:
             if self._frame_id is not None and stamp.frame_id != self._frame_id:
@@ -106,7 +106,7 @@ class Live:
         except AscaError as error:
             if not self.health.unreadable:
                 self._log("unreadable", trouble=str(error), said="once; diagnostics count the others")
-            self.health.refuse(str(error))
+            self.health.count_unreadable(str(error))
             return
         self._queue.put(points, _Taken(stamp, at_s))
         self.health.dropped = self._queue.dropped
@@ -127,7 +127,7 @@ class Live:
                     boxes = self._tracker(found, stamp.seconds or taken.at_s)
                 self._answer(stamp, boxes)
                 names = boxes.detections.names if isinstance(boxes, Tracks) else boxes.names
-                self.health.answer(1e3 * (monotonic() - taken.at_s), names, found.report.warnings)
+                self.health.count_answered(1e3 * (monotonic() - taken.at_s), names, found.report.warnings)
                 self._working_since = monotonic() if self._queue.taken - before > count else None
         except BaseException as error:
             self.health.failure = str(error) or type(error).__name__

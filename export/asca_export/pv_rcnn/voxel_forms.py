@@ -149,7 +149,7 @@ def export_voxels(
         steps: rows behind the first product are uint8, a step worth this (C,), unitless.
     """
     graph, counted = RowGraph(backbone.product, eight_bit), steps is not None
-    rows = graph.take("features", TensorProto.FLOAT, "voxels", VOXEL_VALUES)
+    rows = graph.add_input("features", TensorProto.FLOAT, "voxels", VOXEL_VALUES)
     missing = np.zeros(VOXEL_VALUES, np.float32)
     for number, layer in enumerate(backbone.layers):
         product = backbone.product(layer.name)
@@ -165,7 +165,7 @@ def export_voxels(
             factors = graph.constant(layer.name, "factors", (steps[layer.name] / STEP_VALUE).numpy())
             graph.named("Mul", [layer.level], graph.in_float(layer.name, "level", rows), factors)
         kind = TensorProto.UINT8 if counted and layer.level == OUT else TensorProto.FLOAT
-        graph.give(layer.level, kind, f"{layer.level}_voxels", product.out_features)
+        graph.add_output(layer.level, kind, f"{layer.level}_voxels", product.out_features)
     graph.save(path, "voxels")
 
 

@@ -17,7 +17,7 @@ from asca_pillars.ops.two_stage.first_stage import FirstStage, second_stage_inpu
 from asca_pillars.ops.two_stage.prepare import refine_scan
 
 
-def prove_refine_parity(
+def check_refine_parity(
     refiner: PillarRefiner,
     stage: FirstStage,
     runtime: RefinePipeline,

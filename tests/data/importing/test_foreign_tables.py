@@ -83,7 +83,7 @@ def test_one_bad_box_of_waymo_costs_itself(column: str, value: Any, tmp_path: Pa
 
 
 @pytest.mark.parametrize(
-    ("table", "column", "value", "said"),
+    ("table", "column", "value", "message"),
     [
         ("lidar", f"{IMAGE}.shape", [4, -360, -4], "for the shape"),
         ("lidar", f"{IMAGE}.shape", [3, 480, 4], "for 4 lasers"),
@@ -93,7 +93,9 @@ def test_one_bad_box_of_waymo_costs_itself(column: str, value: Any, tmp_path: Pa
         ("lidar_pose", "[LiDARPoseComponent].range_image_return1.shape", [4, 1080, 2], "poses of shape"),
     ],
 )
-def test_one_bad_image_of_waymo_costs_its_frame(table: str, column: str, value: Any, said: str, tmp_path: Path) -> None:
+def test_one_bad_image_of_waymo_costs_its_frame(
+    table: str, column: str, value: Any, message: str, tmp_path: Path
+) -> None:
     source = write_segment(tmp_path / "waymo", moved_m=1.0)
     change_parquet(
         source / table / "segment.parquet",
@@ -101,7 +103,7 @@ def test_one_bad_image_of_waymo_costs_its_frame(table: str, column: str, value: 
         lambda old: [*old[:-2], value, old[-1]] if table == "lidar" else [old[0], value],
     )
     output = invoke("import", source, tmp_path / "out", "--from", "waymo")
-    assert re.search(f"left out, frames: 1, the first: .*{said}", output), output
+    assert re.search(f"left out, frames: 1, the first: .*{message}", output), output
     assert BoxSplit(tmp_path / "out").frame_ids == ("segment/1000",)
 
 

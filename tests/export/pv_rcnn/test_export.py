@@ -21,7 +21,7 @@ from asca_deploy.pv_rcnn.graphs import balls_around, deform_inputs, keeps_memory
 from asca_deploy.pv_rcnn.pipeline import PvRcnnPipeline
 from asca_export.pv_rcnn.export import export_pv_rcnn_bundle
 from asca_export.pv_rcnn.graphs import export_deform, export_refine_head
-from asca_export.pv_rcnn.parity import prove_pv_rcnn_parity
+from asca_export.pv_rcnn.parity import check_pv_rcnn_parity
 from asca_pillars.base.errors import BundleError, ExportError
 from asca_pillars.config.pv_rcnn import PvRcnnModel
 from asca_pillars.config.tree import load_config
@@ -165,12 +165,12 @@ def test_other_weights_are_no_parity(trained: Trained, part: str, stage: str) ->
         with torch.no_grad():
             weight.add_(0.5)
         with pytest.raises(ExportError, match=f"part at stage ({stage})"):
-            prove_pv_rcnn_parity(detector.network, PvRcnnPipeline(folder, bundle), SCANS[:1])
+            check_pv_rcnn_parity(detector.network, PvRcnnPipeline(folder, bundle), SCANS[:1])
     finally:
         with torch.no_grad():
             weight.copy_(kept)
     with pytest.raises(ExportError, match="none of the scans"):
-        prove_pv_rcnn_parity(detector.network, PvRcnnPipeline(folder, bundle), [np.empty((0, 4), np.float32)])
+        check_pv_rcnn_parity(detector.network, PvRcnnPipeline(folder, bundle), [np.empty((0, 4), np.float32)])
 
 
 def test_pooling_of_balls(trained: Trained, tmp_path: Path) -> None:

@@ -18,8 +18,8 @@ from asca_deploy.manifest import load_bundle, write_bundle_manifest
 from asca_deploy.pv_rcnn.graphs import OUT, voxel_inputs
 from asca_deploy.pv_rcnn.pipeline import PvRcnnPipeline
 from asca_export import graphs, int8
+from asca_export.bundle_writer import ExportOptions
 from asca_export.int8 import logit_error
-from asca_export.proven_bundle import ExportOptions
 from asca_export.pv_rcnn.export import export_pv_rcnn_bundle
 from asca_export.pv_rcnn.int8 import quantize_pv_rcnn_bundle
 from asca_export.pv_rcnn.voxel_forms import VoxelProducts, VoxelSample, scale_voxels_to_steps

@@ -16,9 +16,9 @@ from asca_deploy.bundle import GRAPHS, MANIFEST
 from asca_deploy.golden import golden_stages
 from asca_deploy.manifest import load_pillar_bundle
 from asca_deploy.two_stage.pipeline import RefinePipeline
+from asca_export.bundle_writer import ExportOptions
 from asca_export.int8 import MAX_LOGIT_ERROR
 from asca_export.pillar.export import export_pillar_bundle
-from asca_export.proven_bundle import ExportOptions
 from asca_export.two_stage import export as refine_exporter
 from asca_export.two_stage.export import export_refine_bundle
 from asca_export.two_stage.graphs import fold_norms

@@ -13,8 +13,8 @@ import torch
 from asca_deploy.bundle import MANIFEST
 from asca_deploy.manifest import load_pillar_bundle
 from asca_deploy.shipped import shipped_bundles
+from asca_export.bundle_writer import ExportOptions
 from asca_export.pillar.export import export_pillar_bundle
-from asca_export.proven_bundle import ExportOptions
 from asca_export.two_stage.first_stage import BundleFirstStage, open_exported
 from asca_pillars.base.errors import BundleError, ConfigError, ExportError
 from asca_pillars.detection.proposals import ProposalSettings
