@@ -217,18 +217,18 @@ _DIGITS = 16
 _BEFORE = len('["", ') + _DIGITS
 
 
-def sealed(text: str, key: str) -> str:
+def add_checksum(text: str, key: str) -> str:
     """Return the line of a JSON text that has no line break, with its end."""
     return f'["{_digest(text, key)}", {text}]\n'
 
 
-def unsealed(line: bytes, key: str) -> str | None:
-    """Return the JSON text of a line that `sealed` made with the same key; None for anything else."""
+def verify_checksum(line: bytes, key: str) -> str | None:
+    """Return the JSON text of a line that `add_checksum` made with the same key; None for anything else."""
     try:
         text = line[_BEFORE:-2].decode()
     except UnicodeDecodeError:
         return None
-    return text if line == sealed(text, key).encode() else None
+    return text if line == add_checksum(text, key).encode() else None
 
 
 def _digest(text: str, key: str) -> str:

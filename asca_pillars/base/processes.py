@@ -23,7 +23,7 @@ Result = TypeVar("Result")
 _THREADS = ("OPENBLAS_NUM_THREADS", "OPENCV_FOR_THREADS_NUM", "OMP_NUM_THREADS")
 
 
-def in_processes(
+def map_in_processes(
     job: Callable[[Item], Result],
     todo: Sequence[Item],
     workers: int,
@@ -52,7 +52,7 @@ def in_processes(
     with contextlib.ExitStack() as stack:
         if workers > 1:
             pool = stack.enter_context(_pool(job, workers))
-            results = _shared_out(todo, at_once, pool)
+            results = _ordered_results(todo, at_once, pool)
         else:
             results = map(job, todo)
         yield from track(results, title, total=len(todo), console=console, disable=not progress)
@@ -102,7 +102,7 @@ def _pool(job: Callable[[Any], Any], workers: int) -> Iterator[_Pool]:
             process.join()
 
 
-def _shared_out(todo: Sequence[Any], at_once: int, pool: _Pool) -> Iterator[Any]:
+def _ordered_results(todo: Sequence[Any], at_once: int, pool: _Pool) -> Iterator[Any]:
     """Yield the results of the items in their order.
 
     Raises:

@@ -36,7 +36,7 @@ RESULTS_FILE = "results.md"
 TIMED_ROUNDS = 10
 
 
-def claim(out: Path, base: dict[str, Any]) -> None:
+def require_same_base(out: Path, base: dict[str, Any]) -> None:
     """Note what all runs in `out` have in common, or refuse to mix them with runs on another base.
 
     Raises:

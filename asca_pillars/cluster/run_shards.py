@@ -11,7 +11,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from asca_pillars.base.errors import ClusterError
 from asca_pillars.base.locks import recover
 from asca_pillars.cluster.ray_pool import RayPool, connected
-from asca_pillars.cluster.shards import Outcome, Result, Shard, cut, process_shards
+from asca_pillars.cluster.shards import Outcome, Result, Shard, make_shards, process_shards
 
 
 def run_shards(
@@ -88,7 +88,7 @@ def run_each(
     if not items:
         return
     lost: list[Any] = []
-    shards = cut(items, shard_size)
+    shards = make_shards(items, shard_size)
     for outcome in run_shards(
         partial(_each, job), shards, address, seen=seen, folders=folders, title=title, progress=progress
     ):

@@ -19,7 +19,7 @@ from asca_pillars.evaluation.errors.analysis import prepare_errors, report_error
 from asca_pillars.evaluation.errors.error_frames import BoxErrorFrames
 from asca_pillars.evaluation.kitti_evaluation import TEXT_SCORE, warn_of_degrees, warn_of_unlike_scans
 from asca_pillars.evaluation.model import Model, OpenModel, model_scores, scores_by_class
-from asca_pillars.evaluation.report_files import MADE_BY, PREDICTIONS_FOLDER, claim, write_report
+from asca_pillars.evaluation.report_files import MADE_BY, PREDICTIONS_FOLDER, check_output_folder, write_report
 from asca_pillars.evaluation.report_page import ReportPage
 
 PREDICTIONS = "detections.jsonl"
@@ -31,7 +31,7 @@ def evaluate_boxes(
     """Evaluate by IoU or by distance; write the tables, the JSON, and the model's predictions."""
     data, predictions = task.data, task.predictions
     assert data is not None, "checked with the arguments"
-    claim(protocol, task.out, task.json, predictions, (task.model, data, *task.beside))
+    check_output_folder(protocol, task.out, task.json, predictions, (task.model, data, *task.beside))
     split = open_split(data, task.split_name)
     about: dict[str, Any] = {"data": str(data), "split": task.split_name}
     if task.around and isinstance(split, BoxSplit) and split.has_camera:

@@ -36,7 +36,7 @@ from asca_pillars.evaluation.report_files import (
     GALLERY_FOLDER,
     MADE_BY,
     PREDICTIONS_FOLDER,
-    claim,
+    check_output_folder,
     write_report,
 )
 from asca_pillars.evaluation.report_page import ReportPage
@@ -60,7 +60,7 @@ def evaluate_text(task: EvaluationTask, open_model: OpenModel, reporter: Reporte
     """Evaluate by KITTI's or Waymo's protocol, on KITTI text; write the reports, curves, gallery and predictions."""
     kitti, predictions, labels, out = task.protocol == "kitti", task.predictions, task.labels, task.out
     inputs = (task.model, task.data, labels, task.compare, *task.beside)
-    claim("report" if kitti else task.protocol, out, task.json, predictions, inputs)
+    check_output_folder("report" if kitti else task.protocol, out, task.json, predictions, inputs)
     frames_of = None if task.data is None else KittiSplit(task.data, task.split_name)
     if labels is None:
         assert frames_of is not None, "checked with the arguments"

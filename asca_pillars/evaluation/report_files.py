@@ -47,7 +47,7 @@ GALLERY_FOLDER = (COMMAND, gallery.INDEX, ending_with(gallery.INDEX_END))
 """The same of the folder of pictures."""
 
 
-def claim(
+def check_output_folder(
     name: str,
     out: Path,
     json_path: Path | None,
@@ -97,7 +97,7 @@ def write_report(
         name: of the files, see REPORTS.
         page: what is written as Markdown.
         content: what is written as JSON.
-        out: of the evaluation, see `claim`.
+        out: of the evaluation, see `check_output_folder`.
         json_path: None for no other copy.
         scored: the predictions that it is about; those that an earlier evaluation left in `out` are removed.
 

@@ -20,8 +20,8 @@ from asca_deploy.result_files import (
     RUN_FILE,
     UNREADABLE_FILE,
     as_line,
-    claim,
     remove_companions,
+    require_own_results,
     scan_content,
 )
 from asca_deploy.shipped import find_bundle
@@ -33,7 +33,7 @@ from asca_pillars.base.progress import Progress, Remark, Reporter
 from asca_pillars.base.schema import to_dict
 from asca_pillars.base.system import package_versions
 from asca_pillars.cluster.run_shards import run_shards
-from asca_pillars.cluster.shards import RUN_SETTINGS, Shard, ShardFolder, cut
+from asca_pillars.cluster.shards import RUN_SETTINGS, Shard, ShardFolder, make_shards
 from asca_pillars.data.boxes.detector_scope import detector_scope
 from asca_pillars.detection.spec import ScoreThresholds
 from asca_pillars.scans.mounting import Mounting
@@ -172,7 +172,7 @@ def detect_archive(
     if options.provider == "auto":
         raise ConfigError("--provider auto: each machine would choose its own; name one provider with --cluster")
     is_run = json_object("shard_size", "settings")
-    claim(out, {f"{SHARDS}/{RUN_SETTINGS}": is_run})
+    require_own_results(out, {f"{SHARDS}/{RUN_SETTINGS}": is_run})
     require_own(out / SHARDS, COMMAND, {RUN_SETTINGS: is_run})
     for line in scan_input.notes:
         reporter.remark(line)
@@ -180,7 +180,7 @@ def detect_archive(
     folder = ShardFolder(job.shards)
     wanted = min(max(len(scans) // _SHARDS_WANTED, _SHARD_SCANS[0]), _SHARD_SCANS[1])
     size = folder.begin(_results_depend_on(job, scans), wanted)
-    shards = cut([(str(path), scan_input.scale(path)) for path in scans], size)
+    shards = make_shards([(str(path), scan_input.scale(path)) for path in scans], size)
     there = folder.done(reporter.track(shards, "Checking what is done"))
     todo = [shard for shard in shards if shard.name not in there]
     done = len(scans) - sum(len(shard.items) for shard in todo)

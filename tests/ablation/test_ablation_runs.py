@@ -172,14 +172,14 @@ def _accuracies(text: str) -> list[str]:
 
 def test_a_damaged_note_of_the_base_is_one_line_and_can_be_deleted(tmp_path: Path) -> None:
     base = {"config": {"name": "small"}, "data": "data/sim"}
-    ablate_steps.claim(tmp_path, base)
+    ablate_steps.require_same_base(tmp_path, base)
     (tmp_path / "none" / "seed0").mkdir(parents=True)
     (tmp_path / "none" / "seed0" / "train.log").write_text(written_by("asca ablate") + "\n")
     note = tmp_path / "ablation.json"
     note.write_text(note.read_text()[:-5])
     with pytest.raises(TrainingError, match=r"ablation\.json: not what `asca ablate` wrote, or damaged .*; delete it"):
-        ablate_steps.claim(tmp_path, base)
+        ablate_steps.require_same_base(tmp_path, base)
     note.unlink()
-    ablate_steps.claim(tmp_path, base)
+    ablate_steps.require_same_base(tmp_path, base)
     with pytest.raises(TrainingError, match="another base"):
-        ablate_steps.claim(tmp_path, base | {"data": "other"})
+        ablate_steps.require_same_base(tmp_path, base | {"data": "other"})

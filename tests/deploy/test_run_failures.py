@@ -13,7 +13,7 @@ from asca_pillars.base.errors import BundleError, ProviderError
 from asca_pillars.scans.scan_reader import write_scan
 from tests.deploy import conftest as tiny
 from tests.deploy.conftest import needs_openvino
-from tests.deploy.spoiled_graph import respoil
+from tests.deploy.corrupt_graph import corrupt_graph
 from tests.helpers.in_process import run_here
 
 
@@ -58,7 +58,7 @@ FAILURES = pytest.mark.parametrize(
 
 @FAILURES
 def test_of_a_detector_it_is_one_line(bundle_copy: Path, graph: str, spoil: object, message: str) -> None:
-    detector = Detector(respoil(bundle_copy, graph, spoil))  # type: ignore[arg-type]
+    detector = Detector(corrupt_graph(bundle_copy, graph, spoil))  # type: ignore[arg-type]
     scan = tiny.make_scan()
     for detect in (detector, lambda points: list(detector.stream([points, points]))):
         with pytest.raises(BundleError, match=rf"onnxruntime \S+ failed while it ran .*{graph}: .*{message}") as caught:
@@ -71,7 +71,7 @@ def test_of_a_detector_it_is_one_line(bundle_copy: Path, graph: str, spoil: obje
 def test_of_a_command_it_is_one_line(
     bundle_copy: Path, tmp_path: Path, graph: str, spoil: object, message: str
 ) -> None:
-    bundle = respoil(bundle_copy, graph, spoil)  # type: ignore[arg-type]
+    bundle = corrupt_graph(bundle_copy, graph, spoil)  # type: ignore[arg-type]
     scan, scans = tmp_path / "scan.bin", tmp_path / "scans"
     write_scan(scan, tiny.make_scan())
     for number in range(2):

@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 
 from asca_pillars.geometry.overlap import bev_iou
 from asca_pillars.ops.pillar.grid import PillarGrid
-from asca_pillars.ops.pillar.prepare import FEATURES, evenly
+from asca_pillars.ops.pillar.prepare import FEATURES, evenly_spaced_mask
 from asca_pillars.ops.points.sampling import Columns, cells_of
 from asca_pillars.ops.pv_rcnn.voxels import VoxelGrid, Voxels
-from asca_pillars.ops.sparse.rulebooks import CellMap, Links, Shape
+from asca_pillars.ops.sparse.rulebooks import AxisKernelMaps, CellMap, Shape
 
 _NEAREST = 3
 _PAIRS_AT_ONCE = _DISTANCES_AT_ONCE = 1 << 22
@@ -79,7 +79,7 @@ def _fill_pillars(
     pillar_of_point = np.repeat(np.arange(len(cells)), counts)
     stays = kept[pillar_of_point]
     starts = np.cumsum(counts) - counts
-    stays &= evenly(np.arange(len(order)) - starts[pillar_of_point], counts[pillar_of_point], max_points)
+    stays &= evenly_spaced_mask(np.arange(len(order)) - starts[pillar_of_point], counts[pillar_of_point], max_points)
 
     point_counts = np.minimum(counts[kept], max_points)
     features = _features(points.take(order[stays], axis=0), point_counts, grid.cell_centers_m(cells[kept]))
@@ -264,7 +264,7 @@ class NumpyCellMap(CellMap):
         joined = [cells[joins] for source, links in sources for cells, joins in _taps(source.cells, links, self.shape)]
         self.cells = np.unique(np.concatenate(joined))
 
-    def table(self, source: CellMap, links: Links) -> NDArray[np.int32]:
+    def table(self, source: CellMap, links: AxisKernelMaps) -> NDArray[np.int32]:
         taps = [
             np.where(joins, _rows(source.cells, cells), len(source))
             for cells, joins in _taps(self.cells, links, source.shape)
@@ -280,7 +280,7 @@ class NumpyCellMap(CellMap):
 
 
 def _taps(
-    cells: NDArray[np.int64], links: Links, other: Shape
+    cells: NDArray[np.int64], links: AxisKernelMaps, other: Shape
 ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.bool_]]]:
     """Tap by tap: the cells of `other` that it joins with `cells`, and whether it joins them with any; (N,) both."""
     yx, z = np.divmod(cells, len(links.z))

@@ -137,7 +137,7 @@ def test_ignored_proposals_are_detected_and_not_learnt(tmp_path: Path, stage: Pa
     with torch.inference_mode():
         outputs = detector.predict(batch.inputs)
     assert isinstance(batch.inputs, LabeledProposals)
-    batch.inputs.learnt[:] = False
+    batch.inputs.loss_mask[:] = False
     assert detector.loss(outputs, batch.inputs)["confidence"] == 0
     assert len(detector.detect(outputs, SPEC.with_score_threshold(0.0))[0]) > 0
 

@@ -15,7 +15,7 @@ from zipfile import BadZipFile
 import cv2
 import numpy as np
 
-from asca_pillars.base.processes import in_processes
+from asca_pillars.base.processes import map_in_processes
 from asca_pillars.data.insertion.ground_fit import (
     GROUND_BAND_M,
     LATTICE_M,
@@ -165,7 +165,7 @@ def prepare_free_spaces(split: LabeledSplit, prepared: Path, *, camera_view: boo
     """
     require_writable(prepared)
     job = partial(_prepare, split, prepared, camera_view)
-    for _ in in_processes(job, split.frame_ids, workers, "Free ground", at_once=_AT_ONCE):
+    for _ in map_in_processes(job, split.frame_ids, workers, "Free ground", at_once=_AT_ONCE):
         pass
 
 

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_pillars.base.files import portable_name
-from asca_pillars.base.processes import in_processes
+from asca_pillars.base.processes import map_in_processes
 from asca_pillars.data.frames import read_frame
 from asca_pillars.data.insertion.prepared import require_writable, writing
 from asca_pillars.data.labeled_split import LabeledSplit
@@ -119,7 +119,7 @@ def prepare_database(
     if not path.exists():
         require_writable(prepared)
         read = partial(_read_objects, split, tuple(class_names), camera_view)
-        _build(path, in_processes(read, split.frame_ids, workers, "Object database", at_once=_AT_ONCE), built_from)
+        _build(path, map_in_processes(read, split.frame_ids, workers, "Object database", at_once=_AT_ONCE), built_from)
     return ObjectDatabase(path)
 
 

@@ -81,13 +81,13 @@ class RefineDetector(Trainable):
 
     def loss(self, outputs: RefineOutputs, batch: LabeledProposals) -> Mapping[str, Tensor]:
         """Return the terms by name, see `refine_loss`; proposals of IGNORED boxes are left out."""
-        found, targets, learnt = outputs.found, batch.targets, batch.learnt
-        counted = Refinements(found.confidence[learnt], found.residuals[learnt], found.keypoint_logits)
+        found, targets, loss_mask = outputs.found, batch.targets, batch.loss_mask
+        counted = Refinements(found.confidence[loss_mask], found.residuals[loss_mask], found.keypoint_logits)
         wanted = RefineTargets(
-            targets.confidence[learnt],
-            targets.positive[learnt],
-            targets.residuals[learnt],
-            targets.sizes[learnt],
+            targets.confidence[loss_mask],
+            targets.positive[loss_mask],
+            targets.residuals[loss_mask],
+            targets.sizes[loss_mask],
             targets.keypoint_states,
         )
         return refine_loss(counted, wanted)._asdict()

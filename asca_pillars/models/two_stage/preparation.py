@@ -123,7 +123,7 @@ class PreparedRefinement(NamedTuple):
     sample: RefineSample
     proposals: Detections
     """Proposals of the sample, in its order."""
-    learnt: NDArray[np.bool_]
+    loss_mask: NDArray[np.bool_]
     """(S,) those that the loss counts."""
 
 
@@ -132,7 +132,7 @@ class LabeledProposals(NamedTuple):
 
     inputs: RefineInputs
     targets: RefineTargets
-    learnt: Tensor
+    loss_mask: Tensor
     """(R,) bool, the proposals that the loss counts."""
     proposals: tuple[Detections, ...]
     """Proposals of each frame."""
@@ -195,8 +195,8 @@ class RefinePreparation:
     def collate(self, frames: Sequence[PreparedRefinement]) -> LabeledProposals:
         """Collate frames into one batch."""
         batch = collate_samples([frame.sample for frame in frames])
-        learnt = torch.from_numpy(np.concatenate([frame.learnt for frame in frames]))
-        return LabeledProposals(*batch, learnt, tuple(frame.proposals for frame in frames))
+        loss_mask = torch.from_numpy(np.concatenate([frame.loss_mask for frame in frames]))
+        return LabeledProposals(*batch, loss_mask, tuple(frame.proposals for frame in frames))
 
 
 def cached_preparation(model: RefineModel, split: LabeledSplit, data: DataConfig) -> RefinePreparation:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 
 from asca_pillars.base.errors import DatasetError
-from asca_pillars.base.processes import in_processes
+from asca_pillars.base.processes import map_in_processes
 from asca_pillars.base.schema import to_dict
 from asca_pillars.data.insertion.prepared import require_writable, writing
 from asca_pillars.data.labeled_split import LabeledSplit
@@ -87,7 +87,7 @@ class ProposalCache:
         if todo:
             require_writable(self.prepared)
         propose = partial(_propose, self.files, split, self.stage, self.settings, self.camera_view)
-        for _ in in_processes(propose, todo, workers, "Proposing", progress=console is not None, console=console):
+        for _ in map_in_processes(propose, todo, workers, "Proposing", progress=console is not None, console=console):
             pass
 
     def _is_current(self, split: LabeledSplit, frame_id: str) -> bool:

@@ -7,7 +7,7 @@ from typing import Any, Generic, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from asca_pillars.ops.sparse.rulebooks import CellMap, Convolution, Shape, join, stack_rows
+from asca_pillars.ops.sparse.rulebooks import CellMap, Convolution, Shape, build_kernel_map, stack_rows
 
 SUBMANIFOLD = Convolution((3, 3, 3), (1, 1, 1), (1, 1, 1))
 PV_RCNN_STRIDED = (
@@ -64,8 +64,10 @@ class VoxelRulebookBuilder:
         """Map of each level; the caller fills the first one with the voxels."""
         for convolution in strided:
             self.maps.append(CellMap(convolution.output_shape(self.maps[-1].shape)))
-        self._strided_maps = [join(*each) for each in zip(self.strided, self.maps[:-1], self.maps[1:], strict=True)]
-        self._submanifold_maps = [join(SUBMANIFOLD, level, level) for level in self.maps]
+        self._strided_maps = [
+            build_kernel_map(*each) for each in zip(self.strided, self.maps[:-1], self.maps[1:], strict=True)
+        ]
+        self._submanifold_maps = [build_kernel_map(SUBMANIFOLD, level, level) for level in self.maps]
 
     def build(self) -> list[VoxelLevel[NDArray[Any]]]:
         """Build the rulebooks for the active cells of `maps[0]`, level by level."""

@@ -28,7 +28,7 @@ from asca_deploy.recordings.results import (
     track_results,
 )
 from asca_deploy.recordings.sequence_files import SequenceFiles
-from asca_deploy.result_files import ABOUT_FILE, KITTI_FILE, RUN_FILE, claim, remove_companions
+from asca_deploy.result_files import ABOUT_FILE, KITTI_FILE, RUN_FILE, remove_companions, require_own_results
 from asca_deploy.tracker import Tracker
 from asca_pillars.base.errors import ConfigError, ScanError
 from asca_pillars.base.extras import require
@@ -163,7 +163,7 @@ def _detect(task: _Task, reading: ScanSettings, options: RuntimeOptions, reporte
     require("recordings")
     task.files.check((task.path, task.calib))
     calibration = None if task.calib is None else read_calibration(task.calib)
-    claim(task.out, {JOURNAL_FILE: is_journal})
+    require_own_results(task.out, {JOURNAL_FILE: is_journal})
     recording = open_recording(task.path)
     topic = recording.point_cloud_topic(task.topic)
     if task.odometry is not None and not task.track:

@@ -194,7 +194,7 @@ class _Node:
             self.node.create_subscription(kind, "/tf_static", transforms.add, still)
         self._follow()
         self.node.create_timer(_LOOK_S, self._follow)
-        self.node.create_timer(_STATUS_S, self._tell)
+        self.node.create_timer(_STATUS_S, self._publish_diagnostics)
 
     def publishers(self) -> list[Callable[[Stamp, ScanDetections | Tracks], None]]:
         """Return the publishers of the boxes of a scan."""
@@ -260,7 +260,7 @@ class _Node:
 
         return SubscriptionEventCallbacks(message_lost=lost, use_default_callbacks=True)
 
-    def _tell(self) -> None:
+    def _publish_diagnostics(self) -> None:
         level, message = self._live.health.status(self.topic, self.node.count_publishers(self.topic))
         if not self._diagnostics.get_subscription_count():
             return

@@ -82,7 +82,7 @@ def check_pv_rcnn_parity(network: PvRcnn, runtime: PvRcnnPipeline, scans: Sequen
 def _places(network: PvRcnn, batch: VoxelBatch[torch.Tensor], levels: Sequence[torch.Tensor]) -> dict[str, Array]:
     """Return PyTorch's shifted keypoints by the names of the graph's outputs."""
     with torch.inference_mode():
-        places = network.deformed_places(batch, levels)
+        places = network.deformed_positions(batch, levels)
     return {f"{name}_place_{number}": each.numpy() for name, own in places.items() for number, each in enumerate(own)}
 
 

@@ -208,7 +208,7 @@ def test_a_place_for_each_radius(trained: Trained, tmp_path: Path) -> None:
     batch = batch_scans([scan], SPEC)
     with torch.inference_mode():
         levels = network.propose(batch).levels
-        wanted = network.deformed_places(batch, levels)["conv2"]
+        wanted = network.deformed_positions(batch, levels)["conv2"]
     session = onnxruntime.InferenceSession(tmp_path / "deform.onnx", providers=["CPUExecutionProvider"])
     given = deform_inputs(scan, settings, {"conv2": levels[1].numpy()})
     found = session.run(None, {each.name: given[each.name] for each in session.get_inputs()})
