@@ -144,7 +144,7 @@ def check(variants: Sequence[Row], config: str, overrides: Sequence[str], data: 
     base = load_config(config, overrides)
     init = None if init is None else find_checkpoint(init)
     for variant in variants:
-        if reason := variant.misfit(base.model):
+        if reason := variant.base_mismatch(base.model):
             raise ConfigError(f"--variants {variant.name}: {reason}; leave it out, or give a base that fits")
         try:
             initial_weights(load_config(config, (*overrides, *variant.overrides)), init)

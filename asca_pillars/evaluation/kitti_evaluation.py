@@ -22,7 +22,7 @@ from asca_pillars.detection.spec import ScoreThresholds
 from asca_pillars.evaluation import gallery
 from asca_pillars.evaluation.arguments import Evaluation, EvaluationTask
 from asca_pillars.evaluation.curves import write_curves
-from asca_pillars.evaluation.errors.analysis import ErrorAnalysis, prepare_errors, report_errors, who_predicted
+from asca_pillars.evaluation.errors.analysis import ErrorAnalysis, predictions_name, prepare_errors, report_errors
 from asca_pillars.evaluation.errors.error_frames import KittiErrorFrames
 from asca_pillars.evaluation.kitti.average_precision import CLASS_NAMES, DIFFICULTIES, evaluate
 from asca_pillars.evaluation.kitti.kitti_report import BANDS_M, KittiReport, kitti_json, kitti_notes, kitti_tables
@@ -70,7 +70,7 @@ def evaluate_text(task: EvaluationTask, open_model: OpenModel, reporter: Reporte
     if predictions is not None:
         if task.errors:
             assert frames_of is not None, "checked with the arguments"
-            analysis = prepare_errors(who_predicted(predictions), frames_of, task.errors_by, task.beside)
+            analysis = prepare_errors(predictions_name(predictions), frames_of, task.errors_by, task.beside)
         compared = text_task(predictions, labels, frames_of, task.score)
     else:
         assert frames_of is not None, "checked with the arguments"
@@ -139,12 +139,12 @@ def kitti_scores(model: Model, score: ScoreThresholds | None, min_score: float) 
     return scores
 
 
-def warn_of_unlike_scans(model: Model, scans: int, reporter: Reporter) -> None:
+def warn_of_unusual_scans(model: Model, scans: int, reporter: Reporter) -> None:
     """Say how many of the scans are not like those of the training, if any."""
-    if model.unlike:
+    if model.input_warnings:
         reporter.remark(
-            f"{len(model.unlike)} of {scans} scans are unlike those that {model.name} was trained on; "
-            f"the first: {model.unlike[0]}"
+            f"{len(model.input_warnings)} of {scans} scans are unlike those that {model.name} was trained on; "
+            f"the first: {model.input_warnings[0]}"
         )
 
 
@@ -173,7 +173,7 @@ def run_model(
         write_predictions(folder, split, model.detect, camera_view=model.camera_view, reporter=reporter)
         files = sorted(path.name for path in folder.iterdir())
         write_json(folder / MADE_BY, about | {"scores": scores, "files": files})
-    warn_of_unlike_scans(model, len(split.frame_ids), reporter)
+    warn_of_unusual_scans(model, len(split.frame_ids), reporter)
     subject = f"{model.name} on {split.root}, {split.name}"
     return Task(subject, out / "predictions", labels, split, model.spec.ranges, scores, about)
 
@@ -250,13 +250,17 @@ def draw_gallery(
     count = GALLERY_FRAMES if count is None else count
     if task.split is None or count == 0:
         return
-    own = gallery.Judged(task.subject, task.predictions, _judged(frames, task.scores))
-    detectors = [own] if compare is None else _named_apart(own, task, _other(compare, task, frames, reporter))
+    own = gallery.EvaluatedDetector(task.subject, task.predictions, _match_at_scores(frames, task.scores))
+    detectors = (
+        [own] if compare is None else _with_distinct_names(own, task, _read_compared(compare, task, frames, reporter))
+    )
     with atomic_directory(out / "gallery", *GALLERY_FOLDER) as folder:
         gallery.write_gallery(folder, detectors, count, task.split, task.labels, task.ranges, reporter=reporter)
 
 
-def _named_apart(own: gallery.Judged, task: Task, other: gallery.Judged) -> list[gallery.Judged]:
+def _with_distinct_names(
+    own: gallery.EvaluatedDetector, task: Task, other: gallery.EvaluatedDetector
+) -> list[gallery.EvaluatedDetector]:
     """Both, by the names of their models; with their folders where these are the same."""
     both = [replace(own, name=_name(task.about, task.predictions)), other]
     if both[0].name == both[1].name:
@@ -264,16 +268,18 @@ def _named_apart(own: gallery.Judged, task: Task, other: gallery.Judged) -> list
     return both
 
 
-def _other(compare: Path, task: Task, frames: ScoredFrames, reporter: Reporter) -> gallery.Judged:
+def _read_compared(compare: Path, task: Task, frames: ScoredFrames, reporter: Reporter) -> gallery.EvaluatedDetector:
     """The detector whose predictions lie in a folder, at its own scores where an evaluation of it states them."""
     about = _made_by(compare)
     found = read_predictions(compare, frames.truth, task.labels, reporter=reporter)
     if found.shortage is not None:
         reporter.remark(f"--compare {compare}: {found.shortage}")
-    return gallery.Judged(_name(about, compare), compare, _judged(found, task.scores | _stated_scores(about)))
+    return gallery.EvaluatedDetector(
+        _name(about, compare), compare, _match_at_scores(found, task.scores | _stated_scores(about))
+    )
 
 
-def _judged(frames: ScoredFrames, scores: dict[str, float]) -> gallery.Matches:
+def _match_at_scores(frames: ScoredFrames, scores: dict[str, float]) -> gallery.Matches:
     return matches_at_score(frames.truth, frames.detections, CLASS_NAMES, scores=scores)
 
 

@@ -25,7 +25,7 @@ class Model:
         spec: as the model was made, with its own thresholds.
         camera_view: whether it expects only the points in the image.
         about: where it comes from and where it runs, for the report.
-        unlike: for each scan that does not look like those of the training, the first reason.
+        input_warnings: for each scan that does not look like those of the training, the first reason.
     """
 
     name: str
@@ -33,7 +33,7 @@ class Model:
     spec: DetectorSpec
     camera_view: bool
     about: dict[str, Any]
-    unlike: list[str] = field(default_factory=list)
+    input_warnings: list[str] = field(default_factory=list)
 
 
 OpenModel: TypeAlias = Callable[[float | None], Model]

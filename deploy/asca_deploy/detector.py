@@ -25,7 +25,7 @@ from asca_pillars.base.errors import ConfigError, ScanError
 from asca_pillars.base.kernels import load_kernels
 from asca_pillars.base.system import check_threads, own_version
 from asca_pillars.detection import decode
-from asca_pillars.detection.detections import FrameReport, ScanCounts, summed
+from asca_pillars.detection.detections import FrameReport, ScanCounts, sum_counts
 from asca_pillars.geometry.frame_change import FrameChange
 from asca_pillars.scans.input_check import InputWarning, check_input
 from asca_pillars.scans.mounting import Mounting
@@ -259,7 +259,7 @@ class Detector:
         if self.passes == 1:
             detections, counts = found[0], frame.counts[0]
         else:
-            detections, counts = merge(found, frame.turns, self.spec.post.nms_iou), summed(frame.counts)
+            detections, counts = merge(found, frame.turns, self.spec.post.nms_iou), sum_counts(frame.counts)
         if not self._to_model.is_identity:
             detections = replace(detections, boxes=self._to_model.inverse.boxes(detections.boxes))
         frame.stage_times.append((self.pipeline.stages[-1], perf_counter()))

@@ -78,7 +78,7 @@ def test_what_would_end_an_ablation_ends_it_before_anything_is_trained(
     tmp_path: Path, config: str, options: dict[str, Any], message: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     data = write_dataset(tmp_path / "data", 6, val_frames=3)
-    monkeypatch.setattr(ablation_runs, "_asca", lambda *_: pytest.fail("too late"))
+    monkeypatch.setattr(ablation_runs, "_run_command", lambda *_: pytest.fail("too late"))
     given = {"seeds": "0", "variants": "baseline,cpa_channel_lower_ious"} | options
     with pytest.raises(AscaError, match=message):
         ablate(config, data=data, out=tmp_path / "out", **given)

@@ -13,7 +13,7 @@ _QUOTE = reprlib.Repr()
 _QUOTE.maxstring = _QUOTE.maxother = _QUOTE.maxlong = 60
 
 
-class LeftOut:
+class SkippedEntries:
     """What an import cannot use: how much of each kind, and the reason for the first of it."""
 
     def __init__(self) -> None:

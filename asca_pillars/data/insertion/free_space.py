@@ -25,7 +25,7 @@ from asca_pillars.data.insertion.ground_fit import (
     fit_ground,
     order_by_cell,
 )
-from asca_pillars.data.insertion.prepared import require_writable, writing
+from asca_pillars.data.insertion.prepared import require_writable, writable_atomic_path
 from asca_pillars.data.labeled_split import LabeledSplit
 from asca_pillars.geometry.arrays import Floating, Floats, Ints, Mask, Singles
 from asca_pillars.geometry.boxes import footprints
@@ -210,7 +210,7 @@ def _read(path: Path, stamp: Ints) -> FreeSpace | None:
 
 def _write(path: Path, stamp: Ints, space: FreeSpace) -> None:
     ground = space.ground or Ground(np.zeros(3), np.zeros(2), np.zeros((0, 0), np.float16))
-    with writing(path) as temporary:
+    with writable_atomic_path(path) as temporary:
         np.savez(
             temporary,
             stamp=stamp,

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from asca_pillars.base.errors import DatasetError
 from asca_pillars.config.tree import DataConfig, InsertConfig
 from asca_pillars.data.frames import LabeledFrame, other_spelling
-from asca_pillars.data.insertion.free_placement import Scene, is_clear, to_free_place
+from asca_pillars.data.insertion.free_placement import Scene, is_clear, move_to_free_position
 from asca_pillars.data.insertion.free_space import FreeSpace, load_free_space
 from asca_pillars.data.insertion.gt_database import ObjectDatabase, StoredObject, prepare_database
 from asca_pillars.data.insertion.prepared import prepared_folder
@@ -155,7 +155,7 @@ def insert_objects(frame: LabeledFrame, inserter: Inserter, rng: np.random.Gener
         for _ in range(OBJECT_TRIES):
             item = _object_changed(inserter.database[int(rng.choice(inserter.candidates[label]))], change)
             if space is not None:
-                placed = to_free_place(item, space, scene, ranges, rng)
+                placed = move_to_free_position(item, space, scene, ranges, rng)
             else:
                 placed = item if is_clear(item.box, scene.obstacles, ranges) else None
             if placed is not None:

@@ -50,9 +50,8 @@ def findings(inspection: Inspection, spec: InspectedSpec, min_points: int) -> li
     for facts in inspection.classes:
         if facts.positives == 0:
             frames = f"{inspection.frames} of {inspection.frames_in_split} frames of '{inspection.split}'"
-            text = (
-                f"no anchor is positive for {facts.name} in {frames}: {_why_none(facts, inspection, spec, min_points)}"
-            )
+            reason = _no_objects_reason(facts, inspection, spec, min_points)
+            text = f"no anchor is positive for {facts.name} in {frames}: {reason}"
             problems.append(Finding("error", facts.name, text))
     for facts in inspection.classes:
         if facts.positives:
@@ -68,7 +67,7 @@ def findings(inspection: Inspection, spec: InspectedSpec, min_points: int) -> li
     return problems
 
 
-def _why_none(facts: ClassFacts, inspection: Inspection, spec: InspectedSpec, min_points: int) -> str:
+def _no_objects_reason(facts: ClassFacts, inspection: Inspection, spec: InspectedSpec, min_points: int) -> str:
     if facts.boxes == 0:
         return _why_no_boxes(facts.name, inspection)
     if facts.no_points == facts.boxes:

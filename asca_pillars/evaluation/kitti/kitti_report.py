@@ -47,7 +47,7 @@ class KittiReport:
     @property
     def title(self) -> str:
         """The subject, and how many frames stand behind the numbers."""
-        return self.frames.titled(self.subject)
+        return self.frames.title_of(self.subject)
 
 
 def kitti_tables(report: KittiReport) -> list[TextTable]:
@@ -95,7 +95,7 @@ def kitti_json(report: KittiReport) -> dict[str, Any]:
     return {
         "subject": report.subject,
         "frames": len(report.frames),
-        "frames_asked": report.frames.asked,
+        "frames_asked": report.frames.requested,
         "frames_without_predictions": list(report.frames.without_predictions),
         "shortage": report.frames.shortage,
         "types_left_out": list(report.frames.foreign_types),

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_pillars.base.progress import SILENT, Reporter
-from asca_pillars.evaluation.kitti.objects import FrameObjects, stacked
+from asca_pillars.evaluation.kitti.objects import FrameObjects, concatenate_frames
 from asca_pillars.evaluation.kitti.states import is_type
 from asca_pillars.geometry.overlap import paired_bev_intersection
 
@@ -42,7 +42,7 @@ class Frames:
         """The same frames twice, in the same order: once their ground truth, once their detections."""
         frames = np.repeat(np.arange(len(truth)), [len(frame) for frame in truth])
         starts = np.cumsum([0, *(len(frame) for frame in detections)])
-        return cls(stacked(truth), stacked(detections), frames, starts)
+        return cls(concatenate_frames(truth), concatenate_frames(detections), frames, starts)
 
 
 @dataclass(frozen=True, eq=False)

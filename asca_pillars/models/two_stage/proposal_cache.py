@@ -14,7 +14,7 @@ from rich.console import Console
 from asca_pillars.base.errors import DatasetError
 from asca_pillars.base.processes import map_in_processes
 from asca_pillars.base.schema import to_dict
-from asca_pillars.data.insertion.prepared import require_writable, writing
+from asca_pillars.data.insertion.prepared import require_writable, writable_atomic_path
 from asca_pillars.data.labeled_split import LabeledSplit
 from asca_pillars.detection.detections import Detections
 from asca_pillars.ops.two_stage.first_stage import FirstStage, FirstStageSettings, SecondStageInputs, run_first_stage
@@ -110,7 +110,7 @@ def _propose(
     stamp = _stamp(split, frame_id)  # before the scan is read: one that changes meanwhile is read again
     points = split.points(frame_id, camera_view=camera_view)
     found = run_first_stage(stage, points[np.isfinite(points).all(axis=1)], settings)
-    with writing(files.path(frame_id)) as temporary, temporary.open("wb") as file:
+    with writable_atomic_path(files.path(frame_id)) as temporary, temporary.open("wb") as file:
         np.savez(file, allow_pickle=False, stamp=stamp, **_arrays(found))
 
 

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_pillars.base.errors import ScanError
-from asca_pillars.scans.recordings.messages import decoded, time_of
+from asca_pillars.scans.recordings.messages import decode_message, time_of
 from asca_pillars.scans.recordings.other_clouds import foxglove_image
-from asca_pillars.scans.recordings.recording import Message, Recording, Topic, listed, reason
+from asca_pillars.scans.recordings.recording import Message, Recording, Topic, reason, topics_text
 
 ImageKind = Literal["Image", "CompressedImage", "Foxglove"]
 IMAGE_REACH_NS = 500_000_000
@@ -66,7 +66,7 @@ class NearestImages:
         topics = image_topics(recording)
         named = topics if wanted is None else [topic for topic in topics if topic.name == wanted]
         if wanted is not None and not named:
-            raise ScanError(f"{recording.path}: no images on a topic {wanted[:80]}; there are {listed(topics)}")
+            raise ScanError(f"{recording.path}: no images on a topic {wanted[:80]}; there are {topics_text(topics)}")
         self.topic = named[0] if named else None
         self.others = topics if wanted is None and len(topics) > 1 else []
         self.shown = self.unreadable = 0
@@ -130,7 +130,7 @@ def read_image(message: Message, kind: ImageKind) -> CameraImage:
     Raises:
         Exception: it is damaged, or neither JPEG, PNG nor pixels of 8 bits.
     """
-    image = foxglove_image(message) if kind == "Foxglove" else decoded(message, f"sensor_msgs/msg/{kind}")
+    image = foxglove_image(message) if kind == "Foxglove" else decode_message(message, f"sensor_msgs/msg/{kind}")
     time_ns = time_of(image.header, message)
     if time_ns is None:
         raise ValueError("no usable time stamp")

@@ -5,8 +5,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from asca_pillars.base.errors import ScanError
-from asca_pillars.scans.recordings.messages import decoded, time_of
-from asca_pillars.scans.recordings.other_clouds import foxglove_cloud, livox_cloud, packed_points, point_cloud, posed
+from asca_pillars.scans.recordings.messages import decode_message, time_of
+from asca_pillars.scans.recordings.other_clouds import (
+    apply_pose,
+    foxglove_cloud,
+    livox_cloud,
+    packed_points,
+    point_cloud,
+)
 from asca_pillars.scans.recordings.packet_files import velodyne_scan
 from asca_pillars.scans.recordings.recording import Message, reason
 from asca_pillars.scans.recordings.scan_types import ScanKind
@@ -64,9 +70,9 @@ def _read(message: Message, source: str, kind: ScanKind) -> tuple[Any, StoredPoi
         return *point_cloud(message), ()
     if kind == "Livox":
         return *livox_cloud(message), ()
-    cloud = foxglove_cloud(message) if kind == "Foxglove" else decoded(message, "sensor_msgs/msg/PointCloud2")
+    cloud = foxglove_cloud(message) if kind == "Foxglove" else decode_message(message, "sensor_msgs/msg/PointCloud2")
     points, fields = point_cloud_points(cloud, source), tuple(str(field.name) for field in cloud.fields)
-    return cloud.header, posed(points, cloud.pose) if kind == "Foxglove" else points, fields
+    return cloud.header, apply_pose(points, cloud.pose) if kind == "Foxglove" else points, fields
 
 
 def point_cloud_points(cloud: Any, source: str) -> StoredPoints:

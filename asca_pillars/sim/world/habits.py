@@ -12,7 +12,7 @@ QUARTER_TURNS = (0.0, np.pi, np.pi / 2, -np.pi / 2)
 NOSE_IN_M, ALONG_M = (0.5, 1.1), (0.4, 1.8)  # gaps between parked cars side by side and one behind the other
 
 
-Going: TypeAlias = Literal["still", "lane", "crossing", "riding", "walking"]
+MotionKind: TypeAlias = Literal["still", "lane", "crossing", "riding", "walking"]
 """Motion of an object: invisible in a single scan, followed in a sequence."""
 
 
@@ -32,7 +32,7 @@ class Candidate(NamedTuple):
     company: list[Neighbor] | None = None  # of what stands there, once it does, it becomes one
     neighbor: Neighbor | None = None
     half_hidden: bool = False  # something shall stand before it
-    going: Going = "still"
+    going: MotionKind = "still"
 
 
 class Habits:
@@ -170,7 +170,7 @@ class Habits:
         length: float = 0.0,
         sway: tuple[float, float] = (0.0, 0.0),
         *,
-        going: Going = "still",
+        going: MotionKind = "still",
     ) -> Candidate:
         """A candidate beside which others of `company` may stand; `sway` is the spread of its place and heading."""
         across, turn = (float(self.rng.normal(0.0, spread)) if spread else 0.0 for spread in sway)

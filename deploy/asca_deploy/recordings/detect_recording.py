@@ -44,7 +44,7 @@ from asca_pillars.scans.recordings.images import NearestImages
 from asca_pillars.scans.recordings.odometry import Poses, read_poses
 from asca_pillars.scans.recordings.open_recording import open_recording, recording_files
 from asca_pillars.scans.recordings.recorded_scans import RecordedScan, RecordedScans
-from asca_pillars.scans.recordings.recording import listed
+from asca_pillars.scans.recordings.recording import topics_text
 from asca_pillars.scans.scan_settings import ScanSettings
 
 _PLAIN = RuntimeOptions()
@@ -179,7 +179,7 @@ def _detect(task: _Task, reading: ScanSettings, options: RuntimeOptions, reporte
     mounting, said = scans.mounting(reading)
     images = None if task.files.rerun is None else NearestImages(recording, task.image_topic)
     if images is not None and images.topic is not None and images.others:
-        said.append(f"images: of {images.topic.name}; --image-topic takes others of {listed(images.others)}")
+        said.append(f"images: of {images.topic.name}; --image-topic takes others of {topics_text(images.others)}")
     for line in said:
         reporter.remark(line)
     births, weak = track_thresholds(options.bundle, task.score)
