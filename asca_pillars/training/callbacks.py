@@ -36,7 +36,7 @@ class SaveOnInterrupt(Checkpoint):
 
     def __init__(self, last: LastCheckpoint) -> None:
         self.last = last
-        self.asked = False
+        self.stop_requested = False
         self._before: dict[int, Any] = {}
 
     @contextlib.contextmanager
@@ -64,11 +64,11 @@ class SaveOnInterrupt(Checkpoint):
             self._stop(trainer)
 
     def _request_stop(self, number: int, *_: Any) -> None:
-        self.asked = True
+        self.stop_requested = True
         signal.signal(number, self._before[number])
 
     def _any_rank_requested_stop(self, trainer: L.Trainer) -> bool:
-        return trainer.strategy.reduce_boolean_decision(self.asked, all=False)
+        return trainer.strategy.reduce_boolean_decision(self.stop_requested, all=False)
 
     def _stop(self, trainer: L.Trainer) -> None:
         raise TrainingInterruptedError(f"interrupted and saved at step {trainer.global_step}; the same command goes on")
