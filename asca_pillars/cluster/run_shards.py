@@ -65,7 +65,7 @@ def run_shards(
             recover(folder)
 
 
-def run_each(
+def run_items(
     job: Callable[[Any], None],
     items: Sequence[Any],
     address: str,
@@ -90,13 +90,13 @@ def run_each(
     lost: list[Any] = []
     shards = make_shards(items, shard_size)
     for outcome in run_shards(
-        partial(_each, job), shards, address, seen=seen, folders=folders, title=title, progress=progress
+        partial(_run_shard, job), shards, address, seen=seen, folders=folders, title=title, progress=progress
     ):
         lost += outcome.shard.items if outcome.died else ()
     if lost:
         raise ClusterError(f"{title}: {', '.join(map(str, lost))} ended each process that worked on it")
 
 
-def _each(job: Callable[[Any], None], shard: Shard) -> None:
+def _run_shard(job: Callable[[Any], None], shard: Shard) -> None:
     for item in shard.items:
         job(item)

@@ -36,7 +36,7 @@ def draw_training_frames(folder: Path, frames: TrainingFrames, count: int) -> li
         name = portable_name(f"{position:02d}_{frame.frame_id}".replace("/", "_"))
         path = folder / f"{name}.png"
         write_png(path, draw_training_frame(frame, frames))
-        lines.append(f"{path}: {len(frame.boxes)} boxes{_moved(frame.motion)}")
+        lines.append(f"{path}: {len(frame.boxes)} boxes{_motion_text(frame.motion)}")
     return lines
 
 
@@ -52,7 +52,7 @@ def draw_training_frame(frame: LabeledFrame, frames: TrainingFrames) -> Image:
     return draw_layers(frame.points, layers, frames.spec.ranges)
 
 
-def _moved(motion: Motion) -> str:
+def _motion_text(motion: Motion) -> str:
     """Return in words how augmentation moved the frame as a whole."""
     changes = ["mirrored"] if motion.flipped else []
     if motion.rotation_rad:

@@ -124,7 +124,7 @@ def checkpoint_to_resume(folder: Path, model: ModelConfig) -> tuple[Path | None,
         if not path.exists():
             continue
         require_content(path, TrainingError)
-        if (reason := _why_unusable(path, model)) is None:
+        if (reason := _unusable_reason(path, model)) is None:
             return path, unusable[0] if unusable else None
         unusable.append(f"{path} {reason}")
         weights = path if reason == _WEIGHTS_ALONE else weights
@@ -136,7 +136,7 @@ def checkpoint_to_resume(folder: Path, model: ModelConfig) -> tuple[Path | None,
     return None, None
 
 
-def _why_unusable(path: Path, model: ModelConfig) -> str | None:
+def _unusable_reason(path: Path, model: ModelConfig) -> str | None:
     """Return why a run of this model cannot resume from the checkpoint; None if it can."""
     try:
         content = read_plain(path)

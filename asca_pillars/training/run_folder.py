@@ -86,8 +86,8 @@ def claim_run_folder(out: Path, config: Config, inputs: TrainingInputs, steps: i
     path, frames_path = out / CONFIG_FILE, out / FRAMES_FILE
     require_own_file(path, COMMAND, is_own_config)
     found = read_settings(TrainingInputs, frames_path, (), {}) if frames_path.exists() else None
-    refusal = _why_another(path, config, inputs, steps) if path.exists() else None
-    refusal = refusal or (found and _why_other_frames(frames_path, found, inputs))
+    refusal = _other_run_reason(path, config, inputs, steps) if path.exists() else None
+    refusal = refusal or (found and _other_inputs_reason(frames_path, found, inputs))
     if refusal and any((out / "checkpoints").glob("*.ckpt")):
         raise TrainingError(refusal)
     if inputs.initial_sha256 is None and found is not None:
@@ -131,7 +131,7 @@ def measure_input(out: Path, frames: TrainingFrames, *, keep: bool, bar: bool = 
     return measured
 
 
-def _why_another(path: Path, config: Config, inputs: TrainingInputs, steps: int) -> str | None:
+def _other_run_reason(path: Path, config: Config, inputs: TrainingInputs, steps: int) -> str | None:
     """Return in words how `config` differs from the run that `path` is of; None if it is the same run, or longer."""
     found_config = load_config(path)  # a run of an older version lacks keys that are younger, not their values
     found = to_dict(found_config)
@@ -161,7 +161,7 @@ def _why_another(path: Path, config: Config, inputs: TrainingInputs, steps: int)
     return f"{path}: the run there was started with {difference}; choose another --out, or delete it"
 
 
-def _why_other_frames(path: Path, found: TrainingInputs, inputs: TrainingInputs) -> str | None:
+def _other_inputs_reason(path: Path, found: TrainingInputs, inputs: TrainingInputs) -> str | None:
     """Return in words how `inputs` differs from that of the run in `path`; None if it does not."""
     if found.processes != inputs.processes:
         return (

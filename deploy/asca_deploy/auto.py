@@ -96,10 +96,10 @@ def choose(
     for name in names:
         if name == REFERENCE or precision not in (None, name[1]):
             continue
-        if reason := _left_out(name[0], clock() - start):
+        if reason := _skip_reason(name[0], clock() - start):
             candidates.append(Candidate(*name, None, reason, weights))
             continue
-        trial = _try(name, open_network, detect, expected, spec, clock)
+        trial = _measure_candidate(name, open_network, detect, expected, spec, clock)
         trial = trial._replace(candidate=replace(trial.candidate, weights=weights))
         candidates.append(trial.candidate)
         if trial.network is not None and (best is None or _cost(trial.candidate) < _cost(best[0])):
@@ -137,7 +137,7 @@ class _Trial(NamedTuple, Generic[Network]):
     """None unless it agrees with the reference."""
 
 
-def _try(
+def _measure_candidate(
     name: tuple[Provider, Precision],
     open_network: Callable[[Provider, Precision], Network],
     detect: Callable[[Network], Detections],
@@ -154,7 +154,7 @@ def _try(
         return _Trial(Candidate(*name, None, f"does not run: {first_line(error)}"), None)
 
 
-def _left_out(provider: str, elapsed_s: float) -> str | None:
+def _skip_reason(provider: str, elapsed_s: float) -> str | None:
     if provider in SLOW_START:
         return "left out, it takes up to minutes to start: ask for it by name"
     return f"not tried, {BUDGET_S:g} s were over: ask for it by name" if elapsed_s > BUDGET_S else None

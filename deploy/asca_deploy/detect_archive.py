@@ -51,7 +51,7 @@ READ_AGAIN_AFTER_S = (1.0, 5.0)
 _ERROR = '{"error": '
 
 
-class Counts(NamedTuple):
+class ArchiveCounts(NamedTuple):
     """Scans with results, and scans that could not be read."""
 
     detected: int
@@ -68,7 +68,7 @@ class ArchiveResult:
         repeats: how often shards were begun again after their worker had died.
     """
 
-    counts: Counts
+    counts: ArchiveCounts
     done_before: int
     repeats: int
 
@@ -184,14 +184,14 @@ def detect_archive(
     there = folder.done(reporter.track(shards, "Checking what is done"))
     todo = [shard for shard in shards if shard.name not in there]
     done = len(scans) - sum(len(shard.items) for shard in todo)
-    repeats = _work(job, folder, todo, done, address)
+    repeats = _process(job, folder, todo, done, address)
     counts = merge(folder.lines(shards), out)
     if not counts.detected:
         raise ScanError(f"none of the {len(scans)} scans can be read; the reasons are in {out / UNREADABLE_FILE}")
     return ArchiveResult(counts, done, repeats)
 
 
-def merge(lines: Iterable[str], out: Path) -> Counts:
+def merge(lines: Iterable[str], out: Path) -> ArchiveCounts:
     """Part the lines of all shards into results and scans that could not be read, and write the two files."""
     detected = unreadable = 0
     with (
@@ -208,10 +208,10 @@ def merge(lines: Iterable[str], out: Path) -> Counts:
                 detected += 1
                 results.write(line)
     remove_companions(out, [UNREADABLE_FILE])
-    return Counts(detected, unreadable)
+    return ArchiveCounts(detected, unreadable)
 
 
-def _work(job: DetectShard, folder: ShardFolder, todo: Sequence[Shard], done: int, address: str) -> int:
+def _process(job: DetectShard, folder: ShardFolder, todo: Sequence[Shard], done: int, address: str) -> int:
     """Process the shards; return how often one was restarted."""
     if not todo:
         return 0

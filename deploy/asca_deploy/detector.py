@@ -20,7 +20,7 @@ from asca_deploy.ort_session import check_onnxruntime
 from asca_deploy.pipeline import StageTimes
 from asca_deploy.scan_detections import ScanDetections
 from asca_deploy.shipped import find_bundle
-from asca_deploy.stream import overlapped
+from asca_deploy.stream import overlap_stages
 from asca_pillars.base.errors import ConfigError, ScanError
 from asca_pillars.base.kernels import load_kernels
 from asca_pillars.base.system import check_threads, own_version
@@ -228,7 +228,7 @@ class Detector:
             frame.stage_times.append((_WAITING, perf_counter()))
             return self._finish(frame, raw)
 
-        return overlapped(scans, prepare, infer, finish)
+        return overlap_stages(scans, prepare, infer, finish)
 
     def _open(self, points: NDArray[Any]) -> _Frame:
         """Return the usable points in the model's frame."""

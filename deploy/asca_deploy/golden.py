@@ -105,7 +105,7 @@ def golden_stages(pipeline: PillarPipeline | RefinePipeline, points: NDArray[np.
         "labels": candidates.labels,
     }
     found = suppress(candidates, spec.classes, spec.post)
-    return {**stages, "neck+head": _answered(answer), "decode": boxes, "suppress": _detections(found)}
+    return {**stages, "neck+head": _head_arrays(answer), "decode": boxes, "suppress": _detections(found)}
 
 
 def _second_stage(pipeline: RefinePipeline, first: FirstStageOutputs, points: NDArray[np.float32]) -> Stages:
@@ -115,7 +115,7 @@ def _second_stage(pipeline: RefinePipeline, first: FirstStageOutputs, points: ND
     confidence, residuals = pipeline.refine(inputs)
     found = reported_detections(proposed.proposals, confidence, residuals, pipeline.spec, pipeline.section.scores)
     return {
-        "neck+head": {**_answered(HeadOutputs(first.maps, first.cells)), "neck": first.neck},
+        "neck+head": {**_head_arrays(HeadOutputs(first.maps, first.cells)), "neck": first.neck},
         "propose": _detections(proposed.proposals),
         "neighbors": inputs,
         "refine": {"confidence": confidence, "residuals": residuals},
@@ -135,7 +135,7 @@ def _placed(placed: Any) -> dict[str, NDArray[Any]]:
     return {"pillar_features": placed.features, **rulebook_inputs(placed.rulebooks)}
 
 
-def _answered(answer: HeadOutputs) -> dict[str, NDArray[Any]]:
+def _head_arrays(answer: HeadOutputs) -> dict[str, NDArray[Any]]:
     if answer.cells is None:
         return {name: part.transpose(1, 2, 0) for name, part in zip(HeadMaps._fields, answer.maps, strict=True)}
     return {**dict(zip(HeadMaps._fields, answer.maps, strict=True)), "cells": answer.cells}

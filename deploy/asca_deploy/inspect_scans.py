@@ -144,10 +144,10 @@ def inspect_scans(
     times: list[tuple[int, int]] = []
     frame_ids: dict[str, None] = {}
     fields: tuple[str, ...] = ()
-    troubles: list[str] = []
+    error_texts: list[str] = []
     for one in Reporter(progress).track(source.scans, "Inspecting", source.to_read):
         if one.scan is None:
-            troubles.append(str(one.trouble))
+            error_texts.append(str(one.error_text))
             continue
         times.append((one.number, one.time_ns))
         frame_ids[one.frame_id] = None
@@ -158,14 +158,14 @@ def inspect_scans(
     damage = recorded.recording.damage if recorded else None
     if not times:
         of_topic = f" of {recorded.topic.name}" if recorded else ""
-        why = f": {reason}" if (reason := next(iter(troubles), damage)) else ""
+        why = f": {reason}" if (reason := next(iter(error_texts), damage)) else ""
         raise ScanError(f"{path}: none of the {source.to_read} scans{of_topic} can be read{why}")
     found = [*source.notes, *([doubt] if doubt else []), *repairs_of(measured.notes)]
     if recorded:
         found += _odd_times(times)
     if len(frame_ids) > 1:
         found.append(f"the scans are in {len(frame_ids)} frames: {', '.join(frame_ids)[:200]}")
-    problems = [f"{_count(len(troubles), 'scan')} cannot be read: {troubles[0]}"] if troubles else []
+    problems = [f"{_count(len(error_texts), 'scan')} cannot be read: {error_texts[0]}"] if error_texts else []
     return ScansInspection(
         path=str(path),
         model=model.name,
@@ -176,7 +176,7 @@ def inspect_scans(
         fields=fields,
         frame_ids=tuple(filter(None, frame_ids)),
         times=_scan_times(times) if recorded else None,
-        scans=len(times) + len(troubles) if recorded else source.total,
+        scans=len(times) + len(error_texts) if recorded else source.total,
         inspected=len(measured.points),
         points=spread(np.array(measured.points)),
         not_finite=sum(notes.dropped_points for _, notes, _ in measured.notes),

@@ -76,7 +76,7 @@ def load_bundle(folder: str | Path) -> Bundle:
         data = upgrade_schema_2(data)
     data |= {name: first | data[name] for name, first in _LATER_KEYS.items() if isinstance(data.get(name), dict)}
     family: type[Bundle] = PvRcnnBundle if data.get("kind") == "pv_rcnn" else PillarBundle
-    layout = _take_out_layout(manifest, data) if family is PillarBundle else None
+    layout = _pop_layout(manifest, data) if family is PillarBundle else None
     try:
         bundle = parse(family, data, str(manifest))
         if ignored := first_parsing_difference(data, to_dict(bundle)):
@@ -104,7 +104,7 @@ def load_bundle(folder: str | Path) -> Bundle:
     return bundle
 
 
-def _take_out_layout(manifest: Path, data: dict[str, Any]) -> Any:
+def _pop_layout(manifest: Path, data: dict[str, Any]) -> Any:
     """Remove and return the layout of a pillar detector's manifest; later keys of `spec` get their first meaning."""
     if data.get("kind") == "pillar" and "refine" in data:
         raise BundleError(f"{manifest}: `refine` belongs to kind pillar_refine, this is pillar; {EXPORT_AGAIN}")

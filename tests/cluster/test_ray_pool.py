@@ -11,7 +11,7 @@ import pytest
 
 from asca_pillars.base.errors import ClusterError
 from asca_pillars.cluster import ray_pool
-from asca_pillars.cluster.run_shards import run_each, run_shards
+from asca_pillars.cluster.run_shards import run_items, run_shards
 from asca_pillars.cluster.shards import Shard, make_shards, process_shards
 
 pytest.importorskip("ray", reason="needs pip install -e '.[cluster]'")
@@ -95,7 +95,7 @@ def test_each_item_is_done(cluster: Any, tmp_path: Path) -> None:
     left = out / ".1.asca-00000000"
     left.touch()
     job = partial(touch, out)
-    run_each(job, range(5), cluster.address, shard_size=2, seen=seen, folders=[out], title="Touching", progress=False)
+    run_items(job, range(5), cluster.address, shard_size=2, seen=seen, folders=[out], title="Touching", progress=False)
     assert {path.name for path in out.iterdir()} == set("01234"), "and what a killed writer left is gone"
 
 

@@ -261,13 +261,17 @@ class NumpyCellMap(CellMap):
         self.cells = cells
 
     def activate_joined(self, sources: Any) -> None:
-        joined = [cells[joins] for source, links in sources for cells, joins in _taps(source.cells, links, self.shape)]
+        joined = [
+            cells[joins]
+            for source, kernel_maps in sources
+            for cells, joins in _taps(source.cells, kernel_maps, self.shape)
+        ]
         self.cells = np.unique(np.concatenate(joined))
 
-    def table(self, source: CellMap, links: AxisKernelMaps) -> NDArray[np.int32]:
+    def rulebook(self, source: CellMap, kernel_maps: AxisKernelMaps) -> NDArray[np.int32]:
         taps = [
             np.where(joins, _rows(source.cells, cells), len(source))
-            for cells, joins in _taps(self.cells, links, source.shape)
+            for cells, joins in _taps(self.cells, kernel_maps, source.shape)
         ]
         return np.stack(taps, axis=1).astype(np.int32)
 
@@ -280,12 +284,12 @@ class NumpyCellMap(CellMap):
 
 
 def _taps(
-    cells: NDArray[np.int64], links: AxisKernelMaps, other: Shape
+    cells: NDArray[np.int64], kernel_maps: AxisKernelMaps, other: Shape
 ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.bool_]]]:
     """Tap by tap: the cells of `other` that it joins with `cells`, and whether it joins them with any; (N,) both."""
-    yx, z = np.divmod(cells, len(links.z))
-    y, x = np.divmod(yx, len(links.x))
-    for z_tap, y_tap, x_tap in product(links.z.T, links.y.T, links.x.T):
+    yx, z = np.divmod(cells, len(kernel_maps.z))
+    y, x = np.divmod(yx, len(kernel_maps.x))
+    for z_tap, y_tap, x_tap in product(kernel_maps.z.T, kernel_maps.y.T, kernel_maps.x.T):
         other_z, other_y, other_x = z_tap[z], y_tap[y], x_tap[x]
         joins = (other_z >= 0) & (other_y >= 0) & (other_x >= 0)
         yield (other_y * other[2] + other_x) * other[0] + other_z, joins

@@ -324,7 +324,7 @@ class _Part:
             best_score=_best_score([item for item, _ in detections], int(counted.sum())),
             iou_3d=iou,
             boxes=int((counted & boxes).sum()),
-            reaching=_reaching(labels[counted[boxes]], residuals[counted & boxes], iou),
+            reaching=_shares_reaching(labels[counted[boxes]], residuals[counted & boxes], iou),
             groups=tuple(
                 self._group(group, [objects[row] for row in np.flatnonzero(mask)], residuals[mask])
                 for group, mask in _groups(objects).items()
@@ -430,7 +430,7 @@ def _band(low: float, high: float, unit: str) -> str:
     return f"{low:g}+ {unit}" if high == inf else f"{low:g}-{high:g} {unit}"
 
 
-def _reaching(labels: NDArray[np.float64], residuals: NDArray[np.float64], iou: float) -> dict[str, float]:
+def _shares_reaching(labels: NDArray[np.float64], residuals: NDArray[np.float64], iou: float) -> dict[str, float]:
     if not len(labels):
         return {}
     boxes = {name: corrected(labels, residuals, name) for name in CORRECTIONS}

@@ -102,11 +102,11 @@ class NeckRulebookBuilder:
                 self._submanifold_maps[number],
             )
             strided, output = dilated_map.source, dilated_map.target
-            same = submanifold_map.table()
+            same = submanifold_map.rulebook()
             levels.append(
                 LevelRulebooks(
-                    strided=strided_map.table(),
-                    first=same if strided is output else dilated_map.table(),
+                    strided=strided_map.rulebook(),
+                    first=same if strided is output else dilated_map.rulebook(),
                     same=same,
                     strided_back=strided_map.inverse() if self.training else _NO_RULEBOOK,
                     first_back=dilated_map.inverse() if self.training else _NO_RULEBOOK,

@@ -74,13 +74,13 @@ class VoxelRulebookBuilder:
         levels = [self._level(0)]
         for number, stride in enumerate(self._strided_maps, start=1):
             stride.target.activate_joined([(stride.source, stride.outputs)])
-            strided = stride.table()
+            strided = stride.rulebook()
             back = stride.inverse() if self.training else _none(strided.shape[1])
             levels.append(self._level(number)._replace(strided=strided, strided_back=back))
         return levels
 
     def _level(self, number: int) -> VoxelLevel[NDArray[Any]]:
-        same = self._submanifold_maps[number].table() if self.submanifold[number] else _none(SUBMANIFOLD.taps)
+        same = self._submanifold_maps[number].rulebook() if self.submanifold[number] else _none(SUBMANIFOLD.taps)
         return VoxelLevel(self.maps[number].cells, same, _none(0), _none(0))
 
 

@@ -187,7 +187,7 @@ def _fill_flat(
     missing: np.int32,
     table: _Rows,
 ) -> None:
-    """Compute `fill_table` where both lattices are one cell high and the kernel is square, several times as fast."""
+    """Compute `fill_rulebook` where both lattices are one cell high and the kernel is square, several times as fast."""
     nowhere, width = np.uint64(len(start) - 1), len(x_links)
     row = 0
     for i in range(len(cells)):
@@ -204,7 +204,7 @@ def _fill_flat(
 
 
 @compiled(_CELLS, *_LINKS, types.int64, *_COLUMNS, types.int32, out_array(types.int32, 2))
-def fill_table(
+def fill_rulebook(
     cells: _Integers,
     z_links: _Integers,
     y_links: _Integers,

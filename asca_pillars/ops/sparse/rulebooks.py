@@ -165,14 +165,14 @@ class CellMap:
         self._kernels.list_cells(*self.columns, self.shape[0], cells)
         self.cells = cells[:count]
 
-    def table(self, source: "CellMap", kernel_maps: AxisKernelMaps) -> NDArray[np.int32]:
+    def rulebook(self, source: "CellMap", kernel_maps: AxisKernelMaps) -> NDArray[np.int32]:
         """Return the row in `source` that each tap joins with each active cell: (N, K), len(source) for none.
 
         With `Convolution.inputs` it is the rulebook of the convolution from `source` to this map. With `outputs` it is
         the inverse for the backward pass: the output, on the map `source`, that read each input.
         """
         table = np.empty((len(self.cells), math.prod(axis.shape[1] for axis in kernel_maps)), np.int32)
-        self._kernels.fill_table(self.cells, *kernel_maps, source.shape[2], *source.columns, len(source), table)
+        self._kernels.fill_rulebook(self.cells, *kernel_maps, source.shape[2], *source.columns, len(source), table)
         return table
 
     def places(self, parents: "CellMap", halvings: int) -> NDArray[np.int32]:
@@ -199,13 +199,13 @@ class KernelMap(NamedTuple):
     outputs: AxisKernelMaps
     """From the cells of `source` to the cells of `target` that read them."""
 
-    def table(self) -> NDArray[np.int32]:
-        """Return the rulebook of the convolution: (cells of `target`, K) rows of `source`, see `CellMap.table`."""
-        return self.target.table(self.source, self.inputs)
+    def rulebook(self) -> NDArray[np.int32]:
+        """Return the rulebook of the convolution: (cells of `target`, K) rows of `source`, see `CellMap.rulebook`."""
+        return self.target.rulebook(self.source, self.inputs)
 
     def inverse(self) -> NDArray[np.int32]:
         """Return the rulebook of the backward pass: (cells of `source`, K) rows of `target`."""
-        return self.source.table(self.target, self.outputs)
+        return self.source.rulebook(self.target, self.outputs)
 
 
 def build_kernel_map(convolution: Convolution, source: CellMap, target: CellMap) -> KernelMap:

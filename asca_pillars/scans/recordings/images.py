@@ -56,7 +56,7 @@ class NearestImages:
         others: all topics with images, where the first of several was taken.
         shown: how many were given.
         unreadable: how many could not be read.
-        trouble: why the first of these could not be read.
+        error_text: why the first of these could not be read.
 
     Raises:
         ScanError: there are no images on a topic of that name.
@@ -70,7 +70,7 @@ class NearestImages:
         self.topic = named[0] if named else None
         self.others = topics if wanted is None and len(topics) > 1 else []
         self.shown = self.unreadable = 0
-        self.trouble: str | None = None
+        self.error_text: str | None = None
         self._recording = recording
         self._coming: Iterator[CameraImage] | None = None
         self._before: CameraImage | None = None
@@ -99,7 +99,7 @@ class NearestImages:
             return []
         notes = []
         if self.unreadable:
-            notes.append(f"{self.topic.name}: {self.unreadable} images were left out: {self.trouble}")
+            notes.append(f"{self.topic.name}: {self.unreadable} images were left out: {self.error_text}")
         if not self.shown:
             notes.append(f"{self.topic.name}: no image is within {IMAGE_REACH_NS / 1e9:g} s of a scan")
         return notes
@@ -116,12 +116,12 @@ class NearestImages:
                     image = read_image(message, kind)
                 except Exception as error:  # the library lets struct's and NumPy's errors pass
                     self.unreadable += 1
-                    self.trouble = self.trouble or reason(error)
+                    self.error_text = self.error_text or reason(error)
                 else:
                     yield image
         except ScanError as error:  # of its encoding
             self.unreadable += 1
-            self.trouble = self.trouble or str(error)
+            self.error_text = self.error_text or str(error)
 
 
 def read_image(message: Message, kind: ImageKind) -> CameraImage:

@@ -35,7 +35,7 @@ class RecordedScan(NamedTuple):
     time_ns: int
     frame_id: str
     scan: Scan | None
-    trouble: str | None = None
+    error_text: str | None = None
     fields: tuple[str, ...] = ()
 
 

@@ -229,7 +229,7 @@ class _Run:
     def __init__(self, detector: Detector, scans: RecordedScans, journal: Journal) -> None:
         self._detector, self._scans, self._journal = detector, scans, journal
         self._coming: deque[RecordedScan] = deque()
-        self.troubles = [one.trouble for one in journal.results() if one.trouble] if journal.done else []
+        self.error_texts = [one.error_text for one in journal.results() if one.error_text] if journal.done else []
         self.kept: list[DetectedScan] = []
 
     def results(self) -> Iterator[None]:
@@ -254,11 +254,11 @@ class _Run:
 
     def first(self) -> str:
         """Return the first reason why a scan was skipped, as the end of a sentence."""
-        return f": {self.troubles[0]}" if self.troubles else ""
+        return f": {self.error_texts[0]}" if self.error_texts else ""
 
     def skipped(self) -> list[str]:
         """Return a sentence on skipped scans, if there are any."""
-        return [f"{len(self.troubles)} scans were skipped{self.first()}"] if self.troubles else []
+        return [f"{len(self.error_texts)} scans were skipped{self.first()}"] if self.error_texts else []
 
     def _points(self) -> Iterator[NDArray[np.float32]]:
         first = next(number for number in count() if number not in self._journal)
@@ -273,8 +273,8 @@ class _Run:
         """Note the scans before the next one that could be read."""
         while self._coming and self._coming[0].scan is None:
             one = self._coming.popleft()
-            self.troubles.append(str(one.trouble))
-            self._journal.add(ScanResult(one.number, one.time_ns, one.frame_id, None, one.trouble))
+            self.error_texts.append(str(one.error_text))
+            self._journal.add(ScanResult(one.number, one.time_ns, one.frame_id, None, one.error_text))
             yield
 
 

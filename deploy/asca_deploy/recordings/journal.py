@@ -34,7 +34,7 @@ class ScanResult(NamedTuple):
     time_ns: int
     frame_id: str
     detections: Detections | None
-    trouble: str | None = None
+    error_text: str | None = None
     dropped_points: int = 0
 
 
@@ -101,7 +101,7 @@ class Journal:
         found = result.detections
         line: dict[str, Any] = {"number": result.number, "time_ns": result.time_ns, "frame_id": result.frame_id}
         if found is None:
-            line["trouble"] = result.trouble
+            line["trouble"] = result.error_text
         else:
             line |= {"boxes": found.boxes.tolist(), "scores": found.scores.tolist(), "labels": found.labels.tolist()}
             line["dropped_points"] = result.dropped_points

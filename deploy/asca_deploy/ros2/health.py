@@ -27,7 +27,7 @@ class Health:
     lost: int = 0
     """Messages reported lost by the middleware."""
     unreadable: int = 0
-    trouble: str | None = None
+    error_text: str | None = None
     """Reason why the last unreadable one could not be read."""
     warnings: tuple[str, ...] = ()
     """Warnings of the last answered scan."""
@@ -52,7 +52,7 @@ class Health:
         """Count a message that could not be read."""
         with self._lock:
             self.unreadable += 1
-            self.trouble = why
+            self.error_text = why
 
     def count_answered(self, latency_ms: float, names: list[str], warnings: tuple[str, ...]) -> None:
         """Count a scan answered with boxes of these classes."""
@@ -97,7 +97,7 @@ class Health:
             if quiet_s > _QUIET_S:
                 return WARN, f"no scan on {topic} for {quiet_s:.0f} s"
             if unreadable:
-                return WARN, f"{unreadable} scans could not be read: {self.trouble}"
+                return WARN, f"{unreadable} scans could not be read: {self.error_text}"
             if dropped or lost:
                 return WARN, f"{dropped} scans dropped for later ones, {lost} lost on the way"
             if self.warnings:

@@ -93,7 +93,7 @@ def export_refine_bundle(
         options.progress("Putting the first stage in 8 bits")
         quantized = dataclasses.replace(in_float, calibration=calibration)
         eight_bit = _first_bundle(model.first_stage, Path(temporary) / "int8", scans, quantized)
-        return _in_eight_bits(folder, bundle, first, eight_bit, scans, calibration)
+        return _to_int8(folder, bundle, first, eight_bit, scans, calibration)
 
 
 def _copy_first_stage(first: Path, proposing: PillarBundle, folder: Path) -> None:
@@ -101,7 +101,7 @@ def _copy_first_stage(first: Path, proposing: PillarBundle, folder: Path) -> Non
     onnx.save(add_neck_output(onnx.load(first / proposing.graphs[BACKBONE].file)), graphs.graph_path(folder, BACKBONE))
 
 
-def _in_eight_bits(
+def _to_int8(
     folder: Path,
     bundle: PillarBundle,
     first: Path,

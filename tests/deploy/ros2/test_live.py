@@ -105,7 +105,7 @@ def test_no_points_not_numbers_and_other_fields(tiny_bundle: Path, scan: NDArray
     running.end()
     health = running.live.health
     assert (health.received, health.answered, health.unreadable) == (5, 3, 2)
-    assert health.trouble is not None and "no field x" in health.trouble
+    assert health.error_text is not None and "no field x" in health.error_text
     assert [one["event"] for one in running.events].count("unreadable") == 1
 
 
@@ -178,7 +178,7 @@ def test_the_mounting_is_taken_from_the_transforms_when_there_are_some(
     assert running.mountings[-1].sensor_height_m == 0.25
     events = [one["event"] for one in running.events if one["event"] != "reflectance_scale"]
     assert events == ["waiting", "transform", "unreadable"]
-    assert running.live.health.trouble is not None and "bumper" in running.live.health.trouble
+    assert running.live.health.error_text is not None and "bumper" in running.live.health.error_text
 
 
 def test_a_height_is_estimated_from_the_first_scans(tiny_bundle: Path) -> None:
