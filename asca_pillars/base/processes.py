@@ -112,8 +112,8 @@ def _ordered_results(todo: Sequence[Any], at_once: int, pool: _Pool) -> Iterator
     starts = iter(range(0, len(todo), at_once))
     at: dict[Any, int] = {}  # the first item of what each process is at
     done: dict[int, list[Any]] = {}
-    for wanted in range(0, len(todo), at_once):
-        while wanted not in done:
+    for next_index in range(0, len(todo), at_once):
+        while next_index not in done:
             try:
                 for connection in pool.keys() - at.keys():
                     if (start := next(starts, None)) is not None:
@@ -127,7 +127,7 @@ def _ordered_results(todo: Sequence[Any], at_once: int, pool: _Pool) -> Iterator
                 raise WorkerError(
                     f"{dead} of {len(pool)} worker processes were killed, perhaps for want of memory; use fewer workers"
                 ) from None
-        for result in done.pop(wanted):
+        for result in done.pop(next_index):
             if isinstance(result, _Failed):
                 raise result.error
             yield result

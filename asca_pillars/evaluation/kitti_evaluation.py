@@ -262,10 +262,10 @@ def _with_distinct_names(
     own: gallery.EvaluatedDetector, task: Task, other: gallery.EvaluatedDetector
 ) -> list[gallery.EvaluatedDetector]:
     """Both, by the names of their models; with their folders where these are the same."""
-    both = [replace(own, name=_name(task.about, task.predictions)), other]
-    if both[0].name == both[1].name:
-        both = [replace(one, name=f"{one.name}, {one.predictions}") for one in both]
-    return both
+    named = [replace(own, name=_name(task.about, task.predictions)), other]
+    if named[0].name == named[1].name:
+        named = [replace(one, name=f"{one.name}, {one.predictions}") for one in named]
+    return named
 
 
 def _read_compared(compare: Path, task: Task, frames: ScoredFrames, reporter: Reporter) -> gallery.EvaluatedDetector:

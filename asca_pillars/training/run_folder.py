@@ -181,12 +181,12 @@ def _other_inputs_reason(path: Path, found: TrainingInputs, inputs: TrainingInpu
     return None
 
 
-def _first_difference(found: Any, wanted: Any, key: str = "") -> str | None:
+def _first_difference(found: Any, expected: Any, key: str = "") -> str | None:
     if key in NOT_OF_THE_RUN:
         return None
-    if isinstance(found, dict) and isinstance(wanted, dict):
-        for name in wanted | found:
-            if difference := _first_difference(found.get(name), wanted.get(name), f"{key}.{name}".lstrip(".")):
+    if isinstance(found, dict) and isinstance(expected, dict):
+        for name in expected | found:
+            if difference := _first_difference(found.get(name), expected.get(name), f"{key}.{name}".lstrip(".")):
                 return difference
         return None
-    return None if found == wanted else f"{key} = {found}, now {key} = {wanted}"
+    return None if found == expected else f"{key} = {found}, now {key} = {expected}"

@@ -178,8 +178,8 @@ def detect_archive(
         reporter.remark(line)
     job = _job(scan_input.mounting, reading.columns, options, out, score=score, around=around)
     folder = ShardFolder(job.shards)
-    wanted = min(max(len(scans) // _SHARDS_WANTED, _SHARD_SCANS[0]), _SHARD_SCANS[1])
-    size = folder.begin(_results_depend_on(job, scans), wanted)
+    shard_size = min(max(len(scans) // _SHARDS_WANTED, _SHARD_SCANS[0]), _SHARD_SCANS[1])
+    size = folder.begin(_results_depend_on(job, scans), shard_size)
     shards = make_shards([(str(path), scan_input.scale(path)) for path in scans], size)
     there = folder.done(reporter.track(shards, "Checking what is done"))
     todo = [shard for shard in shards if shard.name not in there]

@@ -38,8 +38,8 @@ def read_manifest(manifest: Path) -> dict[str, Any]:
         raise BundleError(f"{manifest} is damaged ({printable(str(error), LONGEST_REASON)}); {EXPORT_AGAIN}") from None
     version = data.get("schema_version") if isinstance(data, dict) else None
     if type(version) is not int:
-        shown = reprlib.repr(version)
-        raise BundleError(f"{manifest} is not a bundle's manifest: `schema_version` is {shown}; {EXPORT_AGAIN}")
+        version_text = reprlib.repr(version)
+        raise BundleError(f"{manifest} is not a bundle's manifest: `schema_version` is {version_text}; {EXPORT_AGAIN}")
     if version > SCHEMA_VERSION:
         raise BundleError(
             f"{manifest}: schema_version {reprlib.repr(version)} is newer than {SCHEMA_VERSION}, which this version "

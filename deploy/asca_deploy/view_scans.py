@@ -96,8 +96,10 @@ class ScanServer:
         paths = [scan.path for scan in named]
         scan_input = ScanInput(reading, paths)
         detector = open_detector(options, score, scan_input.mounting, around=around)
-        shown = {one.name: one.score_threshold for one in detector.spec.classes}
-        lowest = {name: min(value, LOWEST_SCORE) if detector.passes == 1 else value for name, value in shown.items()}
+        thresholds = {one.name: one.score_threshold for one in detector.spec.classes}
+        lowest = {
+            name: min(value, LOWEST_SCORE) if detector.passes == 1 else value for name, value in thresholds.items()
+        }
         detector.spec = detector.pipeline.spec = detector.spec.with_score_threshold(lowest)
         self.names = [scan.name.as_posix() + scan.path.suffix for scan in named]
         self.notes = tuple(scan_input.notes)
@@ -109,7 +111,7 @@ class ScanServer:
             "bundle": detector.bundle.name,
             "runs_on": detector.runs_on,
             "scans": self.names,
-            "classes": [{"name": name, "score": value, "lowest": lowest[name]} for name, value in shown.items()],
+            "classes": [{"name": name, "score": value, "lowest": lowest[name]} for name, value in thresholds.items()],
             "limit": detector.spec.post.max_detections,
             "colors": color_table(detector.spec.class_names),
             "heights": height_table(),

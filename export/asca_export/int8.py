@@ -76,8 +76,8 @@ def calibration_scans(
     Raises:
         ExportError: fewer than MIN_CALIBRATION.
     """
-    shown = {_digest(points) for points in scans}
-    own = [points for points in calibration if _digest(points) not in shown]
+    digests = {_digest(points) for points in scans}
+    own = [points for points in calibration if _digest(points) not in digests]
     dropped = len(calibration) - len(own)
     used = [points for points in own if (spec.grid.cells(points) >= 0).any()]
     if len(used) < MIN_CALIBRATION:
@@ -212,8 +212,8 @@ def logit_error(
 ) -> float:
     """Return the RMS difference of the class logits, at the COMPARED_ANCHORS best anchors of each class and scan."""
     squares = []
-    for want, got in zip(expected, found, strict=True):
-        for ours, theirs in zip(by_class(want, spec), by_class(got, spec), strict=True):
+    for reference, got in zip(expected, found, strict=True):
+        for ours, theirs in zip(by_class(reference, spec), by_class(got, spec), strict=True):
             if len(ours):
                 best = np.argpartition(-ours, min(COMPARED_ANCHORS, ours.size - 1))[:COMPARED_ANCHORS]
                 squares.append(np.square(ours[best] - theirs[best]).mean())

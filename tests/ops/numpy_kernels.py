@@ -295,12 +295,12 @@ def _taps(
         yield (other_y * other[2] + other_x) * other[0] + other_z, joins
 
 
-def _rows(sorted_cells: NDArray[np.int64], wanted: NDArray[np.int64]) -> NDArray[np.int64]:
+def _rows(sorted_cells: NDArray[np.int64], expected: NDArray[np.int64]) -> NDArray[np.int64]:
     """Where each wanted cell stands among the sorted ones, len(sorted_cells) if it does not."""
     if not len(sorted_cells):
-        return np.zeros(len(wanted), np.int64)
-    rows = np.searchsorted(sorted_cells, wanted)
-    found = sorted_cells[np.minimum(rows, len(sorted_cells) - 1)] == wanted
+        return np.zeros(len(expected), np.int64)
+    rows = np.searchsorted(sorted_cells, expected)
+    found = sorted_cells[np.minimum(rows, len(sorted_cells) - 1)] == expected
     return np.where(found, rows, len(sorted_cells))
 
 

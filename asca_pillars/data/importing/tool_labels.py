@@ -226,8 +226,8 @@ def _scans_by_name(scans: Path) -> Callable[[Path, Path], Path]:
         stem = name.stem if name.suffix.lower() in SCAN_SUFFIXES else name.name  # 000000.pcd.json, 000000.json
         candidates = by_stem.get(stem, [])
         if len(candidates) > 1:
-            wanted = place(relative.parent)
-            candidates = [scan for scan in candidates if place(scan.parent.relative_to(scans)) == wanted]
+            label_place = place(relative.parent)
+            candidates = [scan for scan in candidates if place(scan.parent.relative_to(scans)) == label_place]
         if len(candidates) != 1:
             found = " and ".join(map(str, candidates[:2])) or "none"
             raise DatasetError(f"{path}: belongs to one scan {stem}.* below {scans}, there is {found}; correct --scans")

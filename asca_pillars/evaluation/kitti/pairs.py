@@ -66,16 +66,18 @@ class Pairs:
         return Pairs(self.truth[keep], self.detection[keep], self.frame[keep], overlaps)
 
 
-def overlapping_pairs(frames: Frames, wanted: NDArray[np.bool_], above: float, *, reporter: Reporter = SILENT) -> Pairs:
+def overlapping_pairs(
+    frames: Frames, truth_mask: NDArray[np.bool_], above: float, *, reporter: Reporter = SILENT
+) -> Pairs:
     """The pairs whose boxes overlap by more than `above` in the image, from above or in 3D.
 
     Args:
-        wanted: (N,) which ground truth to pair.
+        truth_mask: (N,) which ground truth to pair.
         reporter: of the progress.
     """
     truth_boxes, detection_boxes = _upright_boxes(frames.truth), _upright_boxes(frames.detections)
     found = []
-    for truths in reporter.track(list(_blocks(frames, wanted)), "Overlaps"):
+    for truths in reporter.track(list(_blocks(frames, truth_mask)), "Overlaps"):
         pairs = _all_pairs(frames, truths)
         image = _image_iou(frames.detections.bbox[pairs.detection], frames.truth.bbox[pairs.truth])
         bev, solid = _ground_iou(detection_boxes[pairs.detection], truth_boxes[pairs.truth])
@@ -94,9 +96,9 @@ def dont_care_shares(frames: Frames) -> _Doubles:
     return shares
 
 
-def _blocks(frames: Frames, wanted: NDArray[np.bool_]) -> Iterator[_Indices]:
+def _blocks(frames: Frames, truth_mask: NDArray[np.bool_]) -> Iterator[_Indices]:
     """The wanted ground truth, cut where the pairs with its frames' detections grow too many."""
-    truths = np.flatnonzero(wanted)
+    truths = np.flatnonzero(truth_mask)
     pairs = np.cumsum(np.diff(frames.detection_starts)[frames.truth_frames[truths]])
     cuts = np.flatnonzero(np.diff(pairs // _BLOCK_PAIRS)) + 1
     yield from np.split(truths, cuts)

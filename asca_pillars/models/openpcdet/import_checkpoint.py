@@ -142,14 +142,14 @@ def write_imported(weights: ForeignWeights, config: Config, out: str | Path) -> 
             "give a YAML with --config that has its classes in its order"
         )
     prefix = "" if isinstance(model, PillarModel) else "network."
-    wanted = {name.removeprefix(prefix): value for name, value in build_model(model).state_dict().items()}
-    key_mappings = _key_mappings(weights, model, wanted)
+    our_state = {name.removeprefix(prefix): value for name, value in build_model(model).state_dict().items()}
+    key_mappings = _key_mappings(weights, model, our_state)
     linked = {mapping.target for mapping in key_mappings}
-    if more := [name for name in wanted if name not in linked and not name.endswith("num_batches_tracked")]:
+    if more := [name for name in our_state if name not in linked and not name.endswith("num_batches_tracked")]:
         raise ConfigError(
             f"--config: {weights.library}'s model has no {more[0]}; switch off what {config.name} adds to it"
         )
-    converted = convert_state(weights.state, key_mappings, wanted, str(weights.path))
+    converted = convert_state(weights.state, key_mappings, our_state, str(weights.path))
     content = {
         "hyper_parameters": {"config": to_dict(config)},
         "global_step": weights.steps,
@@ -161,13 +161,13 @@ def write_imported(weights: ForeignWeights, config: Config, out: str | Path) -> 
 
 
 def _key_mappings(
-    weights: ForeignWeights, model: PillarModel | PvRcnnModel, wanted: Mapping[str, Tensor]
+    weights: ForeignWeights, model: PillarModel | PvRcnnModel, our_state: Mapping[str, Tensor]
 ) -> list[KeyMapping]:
     if weights.library == "mmdetection3d":
-        return list(mmdetection3d_keys(model, weights.state, wanted, legacy=weights.legacy))
+        return list(mmdetection3d_keys(model, weights.state, our_state, legacy=weights.legacy))
     if isinstance(model, PillarModel):
         return list(pointpillars_keys(model, weights.state))
-    return list(pv_rcnn_keys(model, weights.state, wanted))
+    return list(pv_rcnn_keys(model, weights.state, our_state))
 
 
 class _Omitted:

@@ -37,14 +37,14 @@ def norm_keys(source: str, target: str) -> Iterator[KeyMapping]:
 
 
 def convert_state(
-    state: Mapping[str, Tensor], key_mappings: Iterable[KeyMapping], wanted: Mapping[str, Tensor], path_text: str
+    state: Mapping[str, Tensor], key_mappings: Iterable[KeyMapping], our_state: Mapping[str, Tensor], path_text: str
 ) -> dict[str, Tensor]:
     """Convert their state dict to ours; every array of theirs is used, or named in the error.
 
     Args:
         state: theirs by name: unitless weights (out, in, ...) and the (C,) values of normalizations.
         key_mappings: what becomes what.
-        wanted: our state dict, for names and shapes.
+        our_state: our state dict, for names and shapes.
         path_text: the file, for messages.
 
     Raises:
@@ -61,14 +61,14 @@ def convert_state(
     converted = {}
     for source, target, convert in key_mappings:
         found = convert(state[source])
-        if found.shape != wanted[target].shape:
+        if found.shape != our_state[target].shape:
             raise TrainingError(
                 f"{path_text}: {source} has shape {tuple(state[source].shape)}, which does not fit {target} "
-                f"{tuple(wanted[target].shape)}; give the model's configuration with --config"
+                f"{tuple(our_state[target].shape)}; give the model's configuration with --config"
             )
-        converted[target] = found.to(wanted[target].dtype).contiguous()
-    counters = {name: value for name, value in wanted.items() if name.endswith(_COUNTER)}
-    assert converted.keys() | counters.keys() == wanted.keys(), "a part of our network has no mapping"
+        converted[target] = found.to(our_state[target].dtype).contiguous()
+    counters = {name: value for name, value in our_state.items() if name.endswith(_COUNTER)}
+    assert converted.keys() | counters.keys() == our_state.keys(), "a part of our network has no mapping"
     return counters | converted
 
 

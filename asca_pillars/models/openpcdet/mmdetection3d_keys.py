@@ -56,14 +56,18 @@ _NAMES: tuple[tuple[str, _Name], ...] = (
 
 
 def mmdetection3d_keys(
-    model: PillarModel | PvRcnnModel, state: Mapping[str, Tensor], wanted: Mapping[str, Tensor], *, legacy: bool = True
+    model: PillarModel | PvRcnnModel,
+    state: Mapping[str, Tensor],
+    our_state: Mapping[str, Tensor],
+    *,
+    legacy: bool = True,
 ) -> Iterator[KeyMapping]:
     """Yield the key mappings for our network of this model.
 
     Args:
         model: ours.
         state: their unitless weights (out, in, ...) by name.
-        wanted: ours, likewise.
+        our_state: ours, likewise.
         legacy: their encoder's flag of that name, see `encoder_keys`; true unless a configuration says otherwise.
 
     Raises:
@@ -76,7 +80,7 @@ def mmdetection3d_keys(
         return
     levels, voxels = (f"{_VOXELS}.encoder_layers.encoder_layer", "backbone_3d.conv"), (_VOXELS, "backbone_3d")
     renamed = {name.replace(*levels).replace(*voxels): array for name, array in state.items()}
-    yield from (_renamed(mapping, "rpn_head") for mapping in pv_rcnn_keys(model, renamed, wanted))
+    yield from (_renamed(mapping, "rpn_head") for mapping in pv_rcnn_keys(model, renamed, our_state))
 
 
 def mmdetection3d_name(name: str, head: str = "rpn_head") -> str:

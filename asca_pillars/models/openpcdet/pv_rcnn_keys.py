@@ -24,27 +24,29 @@ FIRST_CONVOLUTION = "backbone_3d.conv_input.0.weight"
 _JOINED = ("points", *LEVEL_SOURCES)  # after the map
 
 
-def pv_rcnn_keys(model: PvRcnnModel, state: Mapping[str, Tensor], wanted: Mapping[str, Tensor]) -> Iterator[KeyMapping]:
+def pv_rcnn_keys(
+    model: PvRcnnModel, state: Mapping[str, Tensor], our_state: Mapping[str, Tensor]
+) -> Iterator[KeyMapping]:
     """Yield the key mappings for `build_pv_rcnn(model)` without extensions by later papers.
 
     Args:
         model: ours.
         state: their unitless weights (out, in, ...) by name.
-        wanted: ours, likewise.
+        our_state: ours, likewise.
     """
-    yield from _voxel_keys(state, wanted)
+    yield from _voxel_keys(state, our_state)
     yield from map_backbone_keys(model.network.block_convs, _channels_of(_map_order(model)))
     yield from _keypoint_keys(model)
     yield from _refine_keys(model)
 
 
-def _voxel_keys(state: Mapping[str, Tensor], wanted: Mapping[str, Tensor]) -> Iterator[KeyMapping]:
+def _voxel_keys(state: Mapping[str, Tensor], our_state: Mapping[str, Tensor]) -> Iterator[KeyMapping]:
     layers = {"conv_input": "same.0.0", "conv1.0": "same.0.1", "conv_out": "down.3"}
     for level in range(1, len(LEVEL_SOURCES)):
         names = (f"down.{level - 1}", f"same.{level}.0", f"same.{level}.1")
         layers |= {f"conv{level + 1}.{number}": name for number, name in enumerate(names)}
     weights = {f"backbone_3d.{there}.0.weight": f"voxels.{here}.convolution.weight" for there, here in layers.items()}
-    convert = dense_order([(state[there], wanted[here]) for there, here in weights.items() if there in state])
+    convert = dense_order([(state[there], our_state[here]) for there, here in weights.items() if there in state])
     yield from (KeyMapping(there, here, convert) for there, here in weights.items())
     for there, here in layers.items():
         yield from norm_keys(f"backbone_3d.{there}.1", f"voxels.{here}.norm")

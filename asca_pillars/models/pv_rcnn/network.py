@@ -86,9 +86,9 @@ class PvRcnnDetector(Trainable):
         counted = torch.from_numpy(loss_mask).to(device)
         found = outputs.found
         confidence, positive, residuals, sizes = (torch.from_numpy(part[loss_mask]).to(device) for part in targets)
-        wanted = RefineTargets(confidence, positive, residuals, sizes, batch.keypoint_states)
+        targets_in_loss = RefineTargets(confidence, positive, residuals, sizes, batch.keypoint_states)
         kept = Refinements(found.confidence[counted], found.residuals[counted], found.keypoint_logits)
-        terms = first | refine_loss(kept, wanted)._asdict()
+        terms = first | refine_loss(kept, targets_in_loss)._asdict()
         if self.model.box_loss == "va":
             boxes = (kept.residuals[positive].float(), residuals[positive], sizes[positive])
             distance_iou = distance_iou_loss(*boxes).sum() / max(len(boxes[0]), 1)

@@ -83,14 +83,14 @@ class RefineDetector(Trainable):
         """Return the terms by name, see `refine_loss`; proposals of IGNORED boxes are left out."""
         found, targets, loss_mask = outputs.found, batch.targets, batch.loss_mask
         counted = Refinements(found.confidence[loss_mask], found.residuals[loss_mask], found.keypoint_logits)
-        wanted = RefineTargets(
+        targets_in_loss = RefineTargets(
             targets.confidence[loss_mask],
             targets.positive[loss_mask],
             targets.residuals[loss_mask],
             targets.sizes[loss_mask],
             targets.keypoint_states,
         )
-        return refine_loss(counted, wanted)._asdict()
+        return refine_loss(counted, targets_in_loss)._asdict()
 
     def detect(self, outputs: RefineOutputs, spec: DetectorSpec) -> list[Detections]:
         """Return refined boxes of each frame, with the thresholds of `spec`."""

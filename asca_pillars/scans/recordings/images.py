@@ -49,7 +49,7 @@ class NearestImages:
 
     Args:
         recording: to read from.
-        wanted: the topic's name; None: the first one with images.
+        topic_name: the topic's name; None: the first one with images.
 
     Attributes:
         topic: that is read; None: the recording has no images.
@@ -62,14 +62,16 @@ class NearestImages:
         ScanError: there are no images on a topic of that name.
     """
 
-    def __init__(self, recording: Recording, wanted: str | None = None) -> None:
+    def __init__(self, recording: Recording, topic_name: str | None = None) -> None:
         topics = image_topics(recording)
-        named = topics if wanted is None else [topic for topic in topics if topic.name == wanted]
-        if wanted is not None and not named:
-            raise ScanError(f"{recording.path}: no images on a topic {wanted[:80]}; there are {topics_text(topics)}")
+        named = topics if topic_name is None else [topic for topic in topics if topic.name == topic_name]
+        if topic_name is not None and not named:
+            raise ScanError(
+                f"{recording.path}: no images on a topic {topic_name[:80]}; there are {topics_text(topics)}"
+            )
         self.topic = named[0] if named else None
-        self.others = topics if wanted is None and len(topics) > 1 else []
-        self.shown = self.unreadable = 0
+        self.others = topics if topic_name is None and len(topics) > 1 else []
+        self.images_given = self.unreadable = 0
         self.error_text: str | None = None
         self._recording = recording
         self._coming: Iterator[CameraImage] | None = None
@@ -90,7 +92,7 @@ class NearestImages:
             self._before, self._after = self._after, next(self._coming, None)
         if self._before is None or abs(self._before.time_ns - time_ns) > IMAGE_REACH_NS:
             return None
-        self.shown += 1
+        self.images_given += 1
         return self._before
 
     def remarks(self) -> list[str]:
@@ -100,7 +102,7 @@ class NearestImages:
         notes = []
         if self.unreadable:
             notes.append(f"{self.topic.name}: {self.unreadable} images were left out: {self.error_text}")
-        if not self.shown:
+        if not self.images_given:
             notes.append(f"{self.topic.name}: no image is within {IMAGE_REACH_NS / 1e9:g} s of a scan")
         return notes
 

@@ -99,13 +99,13 @@ def point_cloud_points(cloud: Any, source: str) -> StoredPoints:
             Field(str(field.name), np.dtype(order + _DATATYPES[field.datatype - 1]), max(int(field.count), 1))
         )
         offsets.append(int(field.offset))
-    wanted = select_fields(source, fields)
-    for index in wanted:
+    selected = select_fields(source, fields)
+    for index in selected:
         if offsets[index] + fields[index].size_bytes > step:
             raise ScanError(
                 f"{source}: field {fields[index].name} at byte {offsets[index]} lies beyond the points' {step} bytes"
             )
-    chosen = [fields[index] for index in wanted]
+    chosen = [fields[index] for index in selected]
     if not count:
         return assemble_points(0, [np.zeros(0, field.dtype) for field in chosen], chosen)
     if height == 1 or len(data) == count * step:
@@ -117,7 +117,7 @@ def point_cloud_points(cloud: Any, source: str) -> StoredPoints:
             "need more; record it again"
         )
     columns = []
-    for index in wanted:
+    for index in selected:
         view = np.ndarray((height, width), fields[index].dtype, data, offsets[index], (row_step, step))
         columns.append(view.reshape(-1))
     return assemble_points(count, columns, chosen)

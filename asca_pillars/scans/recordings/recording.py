@@ -60,20 +60,20 @@ class Recording(ABC):
     def messages(self, topic: str) -> Iterator[Message]:
         """The messages of a topic in the order of their times; a damaged recording ends early (`damage`)."""
 
-    def point_cloud_topic(self, wanted: str | None = None) -> Topic:
+    def point_cloud_topic(self, topic_name: str | None = None) -> Topic:
         """The topic of that name, or the only one that holds scans.
 
         Raises:
             ScanError: there is none, it holds something else, or there are several; names all that are there.
         """
         clouds = [topic for topic in self.topics if topic.is_point_cloud]
-        if wanted is not None:
-            named = [topic for topic in self.topics if topic.name == wanted]
+        if topic_name is not None:
+            named = [topic for topic in self.topics if topic.name == topic_name]
             if not named:
                 lost = f"; {self.damage}" if self.damage else ""
-                raise ScanError(f"{self.path}: no topic {wanted[:80]}; there are {topics_text(self.topics)}{lost}")
+                raise ScanError(f"{self.path}: no topic {topic_name[:80]}; there are {topics_text(self.topics)}{lost}")
             if not named[0].is_point_cloud and named[0].type != UNKNOWN_TYPE:
-                held = f"{self.path}: {wanted} holds {named[0].type}"
+                held = f"{self.path}: {topic_name} holds {named[0].type}"
                 if conversion := conversion_of(named[0].type):
                     raise ScanError(f"{held}, a type of scans that is not read: {conversion}")
                 remedy = f"choose one of {topics_text(clouds)}" if clouds else self._remedy(self.topics)

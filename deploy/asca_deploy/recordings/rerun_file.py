@@ -57,11 +57,11 @@ class RerunFile:
         assert points is not None, "it shows points"
         rr, stream = self._rr, self._stream
         stream.set_time(TIMELINE, timestamp=np.datetime64(found.time_ns, "ns"))
-        shown = points[:: -(-len(points) // MAX_POINTS) or 1]
+        subset = points[:: -(-len(points) // MAX_POINTS) or 1]
         if self._ground_m is None and len(points):
             self._ground_m = ground_height(points[:, 2])  # once: colors do not flicker
-        colors = height_rgb(shown[:, 2], self._ground_m or 0.0)
-        stream.log("scan", rr.Points3D(shown[:, :3], colors=colors, radii=0.03))
+        colors = height_rgb(subset[:, 2], self._ground_m or 0.0)
+        stream.log("scan", rr.Points3D(subset[:, :3], colors=colors, radii=0.03))
         stream.log("boxes", self._boxes(found))
         if found.tracks is not None:
             stream.log("velocities", self._velocities(found))
@@ -98,8 +98,8 @@ class RerunFile:
 
     def _show(self, image: CameraImage | None) -> None:
         """Log an image that is not shown already; None: the one that is shown goes."""
-        shown, self._image = self._image, image
-        if image is shown:
+        previous, self._image = self._image, image
+        if image is previous:
             return
         if image is None:
             self._stream.log(_CAMERA, self._rr.Clear(recursive=False))

@@ -235,12 +235,12 @@ class _Node:
             "reliable" if one.qos_profile.reliability == qos.ReliabilityPolicy.RELIABLE else "best_effort"
             for one in self.node.get_publishers_info_by_topic(self.topic)
         ]
-        wanted = reliability(offered, self._settings.qos)
-        if wanted is None or wanted == self._reliability:
+        requested = reliability(offered, self._settings.qos)
+        if requested is None or requested == self._reliability:
             return
         if self._subscription is not None:
             self.node.destroy_subscription(self._subscription)
-        profile = qos.QoSProfile(depth=_DEPTH, reliability=getattr(qos.ReliabilityPolicy, wanted.upper()))
+        profile = qos.QoSProfile(depth=_DEPTH, reliability=getattr(qos.ReliabilityPolicy, requested.upper()))
         self._subscription = self.node.create_subscription(
             message_type("sensor_msgs/PointCloud2"),
             self.topic,
@@ -248,8 +248,8 @@ class _Node:
             profile,
             event_callbacks=self._events(),
         )
-        self._reliability = wanted
-        log("subscribed", topic=self.topic, reliability=wanted, publishers=len(offered))
+        self._reliability = requested
+        log("subscribed", topic=self.topic, reliability=requested, publishers=len(offered))
 
     def _events(self) -> Any:
         """Return the callbacks for events of the middleware."""

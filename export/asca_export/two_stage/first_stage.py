@@ -91,11 +91,11 @@ def _with_output(backbone: onnx.ModelProto, elem_type: int) -> tuple[onnx.ModelP
 
 def _before_boxes(model: onnx.ModelProto) -> list[onnx.NodeProto]:
     """Return the nodes that the head's boxes depend on, in order; masks of active cells only affect scores."""
-    wanted = {value.name for value in model.graph.output if value.name != "scores"}
+    needed = {value.name for value in model.graph.output if value.name != "scores"}
     found = []
     for node in reversed(model.graph.node):
-        if wanted & set(node.output):
-            wanted |= set(node.input)
+        if needed & set(node.output):
+            needed |= set(node.input)
             found.append(node)
     return found[::-1]
 

@@ -155,8 +155,8 @@ def test_folded_norms_change_nothing() -> None:
     with torch.no_grad():
         for _ in range(3):
             refiner(inputs)  # statistics that are not those of fresh weights
-        wanted, found = refiner.eval()(inputs), fold_norms(refiner)(inputs)
-    for one, other in zip(wanted, found, strict=True):
+        expected, found = refiner.eval()(inputs), fold_norms(refiner)(inputs)
+    for one, other in zip(expected, found, strict=True):
         torch.testing.assert_close(other, one, atol=1e-4, rtol=1e-4)
     assert any(isinstance(module, torch.nn.BatchNorm1d) for module in refiner.modules())
     assert not any(isinstance(module, torch.nn.BatchNorm1d) for module in fold_norms(refiner).modules())
