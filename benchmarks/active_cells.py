@@ -75,13 +75,13 @@ def _count(
     pooled = map_cells(pillars.cells, spec.grid)
     cells = pillars.cells if pooled is None else pooled.cells
     targets = assign_targets(spec.anchors, spec.classes, boxes, labels)
-    tables, time_ms = _timed(builder, cells)
-    active = np.isin(targets.positives // spec.anchors.shape[2], tables.head_cells)
+    rulebooks, time_ms = _timed(builder, cells)
+    active = np.isin(targets.positives // spec.anchors.shape[2], rulebooks.head_cells)
     matched = set(targets.matched.tolist())
     kept = set(targets.matched[active].tolist())
     head_cells = spec.anchors.shape[0] * spec.anchors.shape[1]
-    shares = [len(level.cells) / (head_cells >> (2 * number)) for number, level in enumerate(tables.levels)]
-    counts = len(active), int(active.sum()), len(matched), len(matched - kept), len(tables.head_cells)
+    shares = [len(level.cells) / (head_cells >> (2 * number)) for number, level in enumerate(rulebooks.levels)]
+    counts = len(active), int(active.sum()), len(matched), len(matched - kept), len(rulebooks.head_cells)
     return *counts, time_ms, shares
 
 
@@ -89,9 +89,9 @@ def _timed(builder: NeckRulebookBuilder, cells: NDArray[np.int64]) -> tuple[Neck
     times_ms = []
     for _ in range(3):
         start = time.process_time()
-        tables = builder.build(cells)
+        rulebooks = builder.build(cells)
         times_ms.append((time.process_time() - start) * 1e3)
-    return tables, min(times_ms)
+    return rulebooks, min(times_ms)
 
 
 if __name__ == "__main__":

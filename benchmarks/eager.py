@@ -26,8 +26,8 @@ from rich.progress import track
 from asca_deploy import Detector, sample_scan_path
 from asca_deploy.benchmark import compare
 from asca_deploy.providers import Precision, Provider
+from asca_export.bundle_writer import MIN_SCANS, ExportOptions
 from asca_export.pillar.export import export_pillar_bundle
-from asca_export.proven_bundle import MIN_SCANS, ExportOptions
 from asca_pillars.base.errors import AscaError
 from asca_pillars.base.system import cpu_model, default_threads, package_versions
 from asca_pillars.cli.bench_tables import comparison_table

@@ -261,7 +261,7 @@ def _marks(folder: Path) -> list[Kind]:
             pass
 
     def evaluate(out: Path) -> None:
-        eval_files.claim("report", out, None, None, ())
+        eval_files.check_output_folder("report", out, None, None, ())
 
     def train(out: Path) -> None:
         require_own_run(out)

@@ -52,13 +52,13 @@ def main(
     expected = Detector(reference)
     table = Table("", title=f"{len(points)} scan(s), against {reference} on cpu in float32")
     columns = []
-    ways: tuple[tuple[str, Provider, Precision], ...] = (
+    configurations: tuple[tuple[str, Provider, Precision], ...] = (
         (int8, "cpu", "float32"),
         (int8, "openvino", "float32"),
         (reference, "openvino", "float32"),
         (reference, "openvino", "reduced"),
     )
-    for bundle, provider, precision in ways:
+    for bundle, provider, precision in configurations:
         name = f"{Path(bundle).name}, {provider} {precision}"
         try:
             detector = Detector(bundle, provider=provider, precision=precision)

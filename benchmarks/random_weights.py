@@ -20,8 +20,8 @@ from torch import nn
 
 from asca_deploy import sample_scan_path
 from asca_deploy.bundle import PillarBundle
+from asca_export.bundle_writer import MIN_SCANS, ExportOptions
 from asca_export.pillar.export import export_pillar_bundle
-from asca_export.proven_bundle import MIN_SCANS, ExportOptions
 from asca_pillars.base.errors import ConfigError
 from asca_pillars.cli.run_command import run_command
 from asca_pillars.config.pillar import PillarModel

@@ -41,7 +41,7 @@ from asca_pillars.models.two_stage.network import RefineDetector, refine_logits
 from asca_pillars.models.two_stage.proposal_cache import ProposalCache
 from asca_pillars.ops.two_stage.decode import Scores, refined_detections, refined_scores
 
-Judged = tuple[Detections, tuple[NDArray[np.float32], NDArray[np.float32]]]
+Refined = tuple[Detections, tuple[NDArray[np.float32], NDArray[np.float32]]]
 """R proposals of a frame, and the second stage's confidence (R,), logits, and residuals (R, 7) for them."""
 
 
@@ -75,7 +75,7 @@ def main(
     print(markdown_table(("3D AP, moderate, R40", *class_names), rows, left=1))
 
 
-def _refined(path: Path, frames: KittiSplit) -> tuple[dict[str, Judged], PostProcess, str]:
+def _refined(path: Path, frames: KittiSplit) -> tuple[dict[str, Refined], PostProcess, str]:
     checkpoint = load_checkpoint(path)
     detector = checkpoint.detector
     if not isinstance(detector, RefineDetector):
@@ -92,19 +92,19 @@ def _refined(path: Path, frames: KittiSplit) -> tuple[dict[str, Judged], PostPro
     return found, checkpoint.config.model.spec.post, f"{parameters} parameters, {checkpoint.steps} steps"
 
 
-def _pv_rcnn(bundle: Path, frames: KittiSplit) -> tuple[dict[str, Judged], PostProcess, str]:
+def _pv_rcnn(bundle: Path, frames: KittiSplit) -> tuple[dict[str, Refined], PostProcess, str]:
     detector = Detector(bundle)
     pipeline = detector.pipeline
     if not isinstance(pipeline, PvRcnnPipeline):
         raise ConfigError(f"{bundle}: of kind {detector.bundle.kind}; give a bundle of kind pv_rcnn")
-    found: dict[str, Judged] = {}
+    found: dict[str, Refined] = {}
     for frame_id in track(frames.frame_ids, "Detecting"):
         raw = pipeline.infer(pipeline.prepare(frames.points(frame_id, camera_view=True), []), [])
         if raw.maps is None:
             nothing = np.empty(0, np.float32)
             found[frame_id] = Detections.empty(pipeline.spec.class_names), (nothing, nothing.reshape(0, 7))
             continue
-        proposals, logits, residuals = pipeline.judge(raw.maps, raw, [])
+        proposals, logits, residuals = pipeline.propose_and_refine(raw.maps, raw, [])
         found[frame_id] = proposals, (logits, residuals)
     return found, pipeline.spec.post, f"{detector.bundle.name}, {detector.runs_on}"
 

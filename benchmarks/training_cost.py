@@ -24,7 +24,7 @@ from asca_pillars.config.tree import load_config
 from asca_pillars.evaluation.report_page import markdown_table
 from asca_pillars.models.build import build_model
 from asca_pillars.training.dataset import open_dataset
-from asca_pillars.training.module import settled
+from asca_pillars.training.module import resolve_precision
 
 WARM_UP = 3
 
@@ -42,7 +42,7 @@ def main(
     model = build_model(settings.model).to(device)
     model.train()
     optimizer = torch.optim.Adam(model.parameters(), lr=settings.train.learning_rate)
-    size, in_bfloat16 = settings.train.batch_size, settled(settings.train.precision, device) == "bf16"
+    size, in_bfloat16 = settings.train.batch_size, resolve_precision(settings.train.precision, device) == "bf16"
     clock = time.process_time if device == "cpu" else time.perf_counter  # other jobs on a CPU do not count
     loading, stepping = [], []
     for number in track(range(batches + WARM_UP), "Measuring"):

@@ -105,8 +105,8 @@ def _detect(path: Path, settings: ScanSettings) -> tuple[list[str], Detections]:
     except AscaError as error:
         return [str(error)], Detections.empty(())
     found = Detector(mounting=scan_input.mounting)(scan.points)
-    told = [text for text in found.report.warnings if "--around" not in text]  # true for the correct revolution, too
-    return [*scan_input.said, *scan.notes.remarks, *told], found
+    warnings = [text for text in found.report.warnings if "--around" not in text]  # also true for the correct one
+    return [*scan_input.notes, *scan.notes.remarks, *warnings], found
 
 
 def _found(right: Detections, boxes: NDArray[np.float32], found: Detections) -> int:

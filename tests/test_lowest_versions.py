@@ -25,8 +25,8 @@ def script() -> Any:
 def test_every_lower_bound_is_installed(script: Any) -> None:
     found = script.lowest_versions(PROJECT, RUN)
     stated = [*PROJECT["dependencies"], *(one for extra in RUN for one in PROJECT["optional-dependencies"][extra])]
-    wanted = {name: bound for name, _, bound in (one.partition(";")[0].partition(">=") for one in stated)}
-    assert found == {name.strip(): bound.strip() for name, bound in wanted.items()}
+    expected = {name: bound for name, _, bound in (one.partition(";")[0].partition(">=") for one in stated)}
+    assert found == {name.strip(): bound.strip() for name, bound in expected.items()}
     assert len(found) > 15 and found["torch"] and found["numba"]
     lines = script.constraints(PROJECT, RUN, ["torch==9.9", "setuptools==80"]).splitlines()
     assert lines == [f"{name}=={bound}" for name, bound in (found | {"torch": "9.9", "setuptools": "80"}).items()]

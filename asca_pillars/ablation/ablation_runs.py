@@ -82,17 +82,17 @@ def finish_runs(
             start = () if init is None else ("--init", str(init))
             where = ("--data", str(data), "--out", str(run.folder), "--devices", "1", *start)
             chosen = [part for text in settings for part in ("-s", text)]
-            with _timed(run.folder / "training_seconds.json") as seconds:
-                _asca(run, ("train", config, *where, *chosen), threads)
+            with _record_seconds(run.folder / "training_seconds.json") as seconds:
+                _run_command(run, ("train", config, *where, *chosen), threads)
             write_json(run.trained, {"seconds": round(sum(seconds)), "threads": threads})
         report = run.evaluated.parent
         where = ("--data", str(data), "--split", split, "--out", str(report))
-        _asca(run, ("eval", str(run.checkpoint), *where, "--gallery", "0", "--provider", "auto"), threads)
+        _run_command(run, ("eval", str(run.checkpoint), *where, "--gallery", "0", "--provider", "auto"), threads)
 
-    _at_once([run for run in todo if not (run.trained.exists() and run.evaluated.exists())], finish, jobs)
+    _run_in_threads([run for run in todo if not (run.trained.exists() and run.evaluated.exists())], finish, jobs)
 
 
-def _at_once(todo: Sequence[Run], work: Callable[[Run], None], jobs: int) -> None:
+def _run_in_threads(todo: Sequence[Run], work: Callable[[Run], None], jobs: int) -> None:
     with ThreadPoolExecutor(jobs) as pool:
         waiting = [pool.submit(work, run) for run in todo]
         try:
@@ -104,7 +104,7 @@ def _at_once(todo: Sequence[Run], work: Callable[[Run], None], jobs: int) -> Non
 
 
 @contextmanager
-def _timed(path: Path) -> Iterator[list[float]]:
+def _record_seconds(path: Path) -> Iterator[list[float]]:
     """Time the block: yield the seconds of every attempt, to which its own are appended; kept in a file.
 
     An attempt that was killed together with this process is not among them.
@@ -118,7 +118,7 @@ def _timed(path: Path) -> Iterator[list[float]]:
         write_json(path, attempts)
 
 
-def _asca(run: Run, arguments: Sequence[str], threads: int) -> None:
+def _run_command(run: Run, arguments: Sequence[str], threads: int) -> None:
     """Run one command as a user would, its output in the run's folder."""
     run.folder.mkdir(parents=True, exist_ok=True)
     log = run.folder / f"{arguments[0]}.log"

@@ -27,7 +27,7 @@ class Row(Protocol):
     def components(self) -> tuple[str, ...]:
         """Cells of the table's first columns."""
 
-    def misfit(self, model: Any) -> str | None:
+    def base_mismatch(self, model: Any) -> str | None:
         """Reason why the row would change more of a base's `model` than its cells show; None if it would not."""
 
 
@@ -75,7 +75,7 @@ class Variant:
             f"model.spec.grid.map={self.map}",
             f"model.network.neck={self.neck}",
             f"model.network.active_cells={self.active_cells}",
-            *self._learnt,
+            *self._loss_settings,
             f"model.spec.grid.zones={self.zones}",
             f"model.spec.grid.v_max_m={along_m}",
             *((f"model.spec.grid.v_y_m={_FINE_M}",) if self.fine_pillars else ()),
@@ -97,13 +97,13 @@ class Variant:
             matching = " / ".join(f"{iou:g}" for iou in self.person_ious)
         return zones, cpa, insert, neck, matching, self.score_target or "-"
 
-    def misfit(self, model: PillarModel) -> str | None:
+    def base_mismatch(self, model: PillarModel) -> str | None:
         """Return why the base does not fit: a row with other thresholds states all classes."""
         sizes = [[astuple(one)[:_SIZES] for one in classes] for classes in (KITTI_CLASSES, model.spec.classes)]
         return "states KITTI's classes" if self.person_ious is not None and sizes[0] != sizes[1] else None
 
     @property
-    def _learnt(self) -> tuple[str, ...]:
+    def _loss_settings(self) -> tuple[str, ...]:
         """Settings of the loss that this variant changes."""
         choices = {"assigner": self.assigner, "score_target": self.score_target}
         chosen = tuple(f"model.loss.{name}={choice}" for name, choice in choices.items() if choice is not None)
@@ -229,7 +229,7 @@ class TwoStageVariant:
             *(self._scales if self.scales else ()),
         )
 
-    def misfit(self, model: PvRcnnModel) -> str | None:
+    def base_mismatch(self, model: PvRcnnModel) -> str | None:
         """Return why the base does not fit: its sources are other than those that the row states."""
         sources = [to_dict(one) for one in model.settings.sources]
         if not sources or sources[0]["source"] != "points":
@@ -252,17 +252,17 @@ class TwoStageVariant:
     def components(self) -> tuple[str, ...]:
         """Cells of the table's first columns, see `TWO_STAGE`."""
         return (
-            _or_dash(self.deform),
+            _dash_if_empty(self.deform),
             "yes" if self.gate != "none" else "-",
             "VectorPool" if self.vector else "balls",
-            _or_dash(self.attention),
+            _dash_if_empty(self.attention),
             "MSAA" if self.scales else "balls",
             "VA" if self.box_loss == "va" else "-",
             str(self.keypoints),
         )
 
 
-def _or_dash(value: str) -> str:
+def _dash_if_empty(value: str) -> str:
     return "-" if value == "none" else value
 
 

@@ -58,12 +58,12 @@ def cached(**options: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]
     return decorate
 
 
-def given(dtype: Any, axes: int = 1) -> Any:
+def in_array(dtype: Any, axes: int = 1) -> Any:
     """Return the type of an array that is only read."""
     return types.Array(dtype, axes, "C", readonly=True)
 
 
-def written(dtype: Any, axes: int = 1) -> Any:
+def out_array(dtype: Any, axes: int = 1) -> Any:
     """Return the type of an array that is written: results, or scratch memory."""
     return types.Array(dtype, axes, "C")
 

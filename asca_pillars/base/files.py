@@ -43,7 +43,7 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         raise OutputError(f"{path}: is {'a folder' if target.is_dir() else 'no regular file'}; choose a file's name")
     longest = _LONGEST_NAME_BYTES - len(".12345678.asca-") - len(os.fsencode(target.suffix))
     stem = os.fsencode(target.stem)[:longest].decode(errors="ignore")
-    with _naming(path), _temporary(target, stem, target.suffix, folder=False) as temporary:
+    with _with_path_in_errors(path), _temporary(target, stem, target.suffix, folder=False) as temporary:
         yield temporary
         _sync(temporary)
         temporary.replace(target)
@@ -64,7 +64,7 @@ def atomic_directory(path: str | Path, command: str, marker: str, is_own: Recogn
     """
     target = _prepare(path)
     require_replaceable(target, command, marker, is_own)
-    with _naming(path), _temporary(target, target.name, "", folder=True) as temporary:
+    with _with_path_in_errors(path), _temporary(target, target.name, "", folder=True) as temporary:
         yield temporary
         for folder, _, names in os.walk(temporary, topdown=False):
             for name in names:
@@ -192,7 +192,7 @@ def _replace_folder(temporary: Path, target: Path) -> None:
 
 
 @contextlib.contextmanager
-def _naming(path: str | Path) -> Iterator[None]:
+def _with_path_in_errors(path: str | Path) -> Iterator[None]:
     """Give the name of `path` to an error of the system that names no file, as of a full disk, or the temporary one."""
     try:
         yield
@@ -217,18 +217,18 @@ _DIGITS = 16
 _BEFORE = len('["", ') + _DIGITS
 
 
-def sealed(text: str, key: str) -> str:
+def add_checksum(text: str, key: str) -> str:
     """Return the line of a JSON text that has no line break, with its end."""
     return f'["{_digest(text, key)}", {text}]\n'
 
 
-def unsealed(line: bytes, key: str) -> str | None:
-    """Return the JSON text of a line that `sealed` made with the same key; None for anything else."""
+def verify_checksum(line: bytes, key: str) -> str | None:
+    """Return the JSON text of a line that `add_checksum` made with the same key; None for anything else."""
     try:
         text = line[_BEFORE:-2].decode()
     except UnicodeDecodeError:
         return None
-    return text if line == sealed(text, key).encode() else None
+    return text if line == add_checksum(text, key).encode() else None
 
 
 def _digest(text: str, key: str) -> str:

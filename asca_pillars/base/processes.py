@@ -23,7 +23,7 @@ Result = TypeVar("Result")
 _THREADS = ("OPENBLAS_NUM_THREADS", "OPENCV_FOR_THREADS_NUM", "OMP_NUM_THREADS")
 
 
-def in_processes(
+def map_in_processes(
     job: Callable[[Item], Result],
     todo: Sequence[Item],
     workers: int,
@@ -52,7 +52,7 @@ def in_processes(
     with contextlib.ExitStack() as stack:
         if workers > 1:
             pool = stack.enter_context(_pool(job, workers))
-            results = _shared_out(todo, at_once, pool)
+            results = _ordered_results(todo, at_once, pool)
         else:
             results = map(job, todo)
         yield from track(results, title, total=len(todo), console=console, disable=not progress)
@@ -102,7 +102,7 @@ def _pool(job: Callable[[Any], Any], workers: int) -> Iterator[_Pool]:
             process.join()
 
 
-def _shared_out(todo: Sequence[Any], at_once: int, pool: _Pool) -> Iterator[Any]:
+def _ordered_results(todo: Sequence[Any], at_once: int, pool: _Pool) -> Iterator[Any]:
     """Yield the results of the items in their order.
 
     Raises:
@@ -112,8 +112,8 @@ def _shared_out(todo: Sequence[Any], at_once: int, pool: _Pool) -> Iterator[Any]
     starts = iter(range(0, len(todo), at_once))
     at: dict[Any, int] = {}  # the first item of what each process is at
     done: dict[int, list[Any]] = {}
-    for wanted in range(0, len(todo), at_once):
-        while wanted not in done:
+    for next_index in range(0, len(todo), at_once):
+        while next_index not in done:
             try:
                 for connection in pool.keys() - at.keys():
                     if (start := next(starts, None)) is not None:
@@ -127,7 +127,7 @@ def _shared_out(todo: Sequence[Any], at_once: int, pool: _Pool) -> Iterator[Any]
                 raise WorkerError(
                     f"{dead} of {len(pool)} worker processes were killed, perhaps for want of memory; use fewer workers"
                 ) from None
-        for result in done.pop(wanted):
+        for result in done.pop(next_index):
             if isinstance(result, _Failed):
                 raise result.error
             yield result

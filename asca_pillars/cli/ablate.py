@@ -72,10 +72,10 @@ def ablate(
         COMMAND,
         RESULTS_FILE,
         check,
-        claim,
         family_of,
         parse_seeds,
         parse_variants,
+        require_same_base,
         setup,
         time_variants,
     )
@@ -89,7 +89,7 @@ def ablate(
     rows = parse_variants(variants, family)
     todo = runs(out, parse_seeds(seeds), rows)
     check(rows, config, overrides, data, init)
-    claim(out, {"config": to_dict(base), "data": str(data)} | ({} if init is None else {"init": str(init)}))
+    require_same_base(out, {"config": to_dict(base), "data": str(data)} | ({} if init is None else {"init": str(init)}))
     waiting = [load_config(config, [*overrides, *one.variant.overrides]) for one in todo if not one.trained.exists()]
     if any(one.augment.insert.method != "none" for one in waiting):
         # Checked once, not by every run.

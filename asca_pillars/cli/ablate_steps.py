@@ -36,7 +36,7 @@ RESULTS_FILE = "results.md"
 TIMED_ROUNDS = 10
 
 
-def claim(out: Path, base: dict[str, Any]) -> None:
+def require_same_base(out: Path, base: dict[str, Any]) -> None:
     """Record what all runs in `out` have in common, or refuse to mix them with runs on another base.
 
     Raises:
@@ -138,13 +138,13 @@ def check(variants: Sequence[Row], config: str, overrides: Sequence[str], data: 
             proven on.
     """
     from asca_deploy.shipped import find_checkpoint
-    from asca_export.proven_bundle import MIN_SCANS
+    from asca_export.bundle_writer import MIN_SCANS
     from asca_pillars.training.checkpoints import initial_weights
 
     base = load_config(config, overrides)
     init = None if init is None else find_checkpoint(init)
     for variant in variants:
-        if reason := variant.misfit(base.model):
+        if reason := variant.base_mismatch(base.model):
             raise ConfigError(f"--variants {variant.name}: {reason}; leave it out, or give a base that fits")
         try:
             initial_weights(load_config(config, (*overrides, *variant.overrides)), init)
@@ -168,8 +168,8 @@ def time_variants(todo: Sequence[Run], family: Family, split: KittiSplit, consol
     """Export one checkpoint of every variant and time them in alternation on the same scans."""
     from asca_deploy import Detector
     from asca_deploy.benchmark import alternate
+    from asca_export.bundle_writer import MIN_SCANS
     from asca_export.export import export_bundle
-    from asca_export.proven_bundle import MIN_SCANS
     from asca_pillars.data.frames import read_frame
     from asca_pillars.models.checkpoint import load_checkpoint
 

@@ -157,22 +157,22 @@ def bench(
         require("recordings")
         recording = open_recording(recordings[0])
         recorded = RecordedScans(recording, recording.point_cloud_topic(topic), settings.reflectance_scale)
-        mounting, said = recorded.mounting(settings)
+        mounting, notes = recorded.mounting(settings)
         points = [scan.points for scan in recorded.first(MOST_SCANS)]
         if not points:
             raise ScanError(f"{recordings[0]}: none of the first scans of {recorded.topic.name} has points")
-        said.append(f"timing the first {len(points)} scans with points")
+        notes.append(f"timing the first {len(points)} scans with points")
     else:
         if topic is not None:
             raise ConfigError(f"--topic {topic}: is for recordings (.mcap, .db3, .bag); leave it out")
         paths = [scan.path for scan in name_scans(scans or [sample_scan_path()])]
         scan_input = ScanInput(settings, paths)
-        mounting, said = scan_input.mounting, scan_input.said
+        mounting, notes = scan_input.mounting, scan_input.notes
         timed = paths[:: -(-len(paths) // MOST_SCANS)]
         if len(timed) < len(paths):
-            said.append(f"timing {len(timed)} of the {len(paths)} scans, evenly spaced")
+            notes.append(f"timing {len(timed)} of the {len(paths)} scans, evenly spaced")
         points = [scan_input.read(path).points for path in timed]
-    for line in said:
+    for line in notes:
         console.print(line, style="yellow", soft_wrap=True)
     if scaling and not len(points[0]):
         raise ScanError("the first scan has no points to take fewer or more of; give another for --scaling")

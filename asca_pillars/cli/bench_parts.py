@@ -78,7 +78,7 @@ def measure_parts(
         result["scaling"] = [asdict(row) for row in rows]
         console.print(show.scaling_table(rows))
     if parts.compare:
-        others = {name: _like(detector, folder) for name, folder in list(bundles.items())[1:]}
+        others = {name: _open_like(detector, folder) for name, folder in list(bundles.items())[1:]}
         compared = compare({next(iter(bundles)): detector} | others, scans, rounds, bar)
         found, *theirs = ([one(points) for points in scans] for one in (detector, *others.values()))
         boxes = {name: box_difference(found, other) for name, other in zip(others, theirs, strict=True)}
@@ -102,7 +102,7 @@ def _has_sparse_backbone(bundle: Bundle) -> bool:
     return not isinstance(bundle, PillarBundle) or bundle.pillar.neck == "sparse"
 
 
-def _like(detector: Detector, folder: Path) -> Detector:
+def _open_like(detector: Detector, folder: Path) -> Detector:
     """Open another bundle with the same settings."""
     return Detector(
         folder,

@@ -67,7 +67,9 @@ def comparison_table(found: Comparison, boxes: Mapping[str, BoxDifference] | Non
     title = "; ".join([f"{found.rounds} rounds in turn", *([_BOXES] if boxes else [])])
     table = _table(title, "", "p50 ms", "p95 ms", "FPS", "times as fast", *(["boxes"] if boxes else []))
     for one in found.contestants:
-        table.add_row(one.name, *_speed(one), *([_apart(boxes[one.name])] if boxes and one.name in boxes else []))
+        table.add_row(
+            one.name, *_speed(one), *([_difference_text(boxes[one.name])] if boxes and one.name in boxes else [])
+        )
     return table
 
 
@@ -79,7 +81,7 @@ def matrix_table(rows: Sequence[MatrixRow]) -> Table:
     for row in rows:
         if row.speed is not None and row.boxes is not None:
             p50_ms, _, fps, speedup = _speed(row.speed)
-            table.add_row(*row.way[:3], str(row.way.threads), p50_ms, fps, speedup, _apart(row.boxes))
+            table.add_row(*row.way[:3], str(row.way.threads), p50_ms, fps, speedup, _difference_text(row.boxes))
     return table
 
 
@@ -129,7 +131,7 @@ def _table(title: str, *columns: str, names: int = 1) -> Table:
     return table
 
 
-def _apart(boxes: BoxDifference) -> str:
+def _difference_text(boxes: BoxDifference) -> str:
     return f"{100 * boxes.center_size_m:.1f} cm ({boxes.lone})"
 
 

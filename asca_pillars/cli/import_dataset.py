@@ -76,7 +76,7 @@ def import_dataset(
 
     from asca_pillars.base.errors import ConfigError, printable
     from asca_pillars.base.extras import require
-    from asca_pillars.data.importing.imported import renamed, require_own_dataset, usable, write_imported
+    from asca_pillars.data.importing.imported import drop_unwritable, rename_types, require_own_dataset, write_imported
     from asca_pillars.scans.scan_settings import ScanSettings
 
     if source_format not in FORMATS:
@@ -99,7 +99,7 @@ def import_dataset(
         raise ConfigError(f"--from {source_format} knows how its scans lie: leave --axes, --columns and the like out")
     imported = form.read(source, out=out, scans=scans, settings=settings)
     names = dict(text.split("=", 1) for text in rename or ())
-    imported = renamed(usable(imported), names)
+    imported = rename_types(drop_unwritable(imported), names)
     counts = write_imported(out, imported, val_share)
     boxes = ", ".join(f"{name} {count}" for name, count in counts.boxes.items()) or "none"
     console = Console(markup=False, highlight=False)

@@ -103,10 +103,12 @@ def scans(inspection: Inspection, kind: InputCells, camera_view: bool) -> Table:
 def recorded(found: ScansInspection) -> list[Table | str]:
     """Return what was inspected; for a recording its topics, if there are several, and its times, frames and fields."""
     of_topic = "" if found.topic is None else f", {printable(found.topic)}"
-    looks_in = ", ".join(f"{axis} {low:g} to {high:g}" for axis, (low, high) in zip("xyz", found.ranges, strict=True))
+    ranges_text = ", ".join(
+        f"{axis} {low:g} to {high:g}" for axis, (low, high) in zip("xyz", found.ranges, strict=True)
+    )
     lines: list[Table | str] = [
         f"{found.path}{of_topic}: {found.inspected} of {found.scans} scans measured",
-        f"against {found.model}, which looks in {looks_in} m",
+        f"against {found.model}, which looks in {ranges_text} m",
         *map(printable, found.notes),
     ]
     if len(found.topics) > 1:

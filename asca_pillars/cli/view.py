@@ -78,7 +78,7 @@ def view(
     )
     options = RuntimeOptions(bundle=bundle, provider=provider, precision=precision, threads=threads)
     with ScanServer(scans, port, options=options, reading=reading, score=read_scores(score), around=around) as server:
-        for line in server.said:
+        for line in server.notes:
             print(line)
         count = len(server.names)
         print(f"{count} scan{'s' if count != 1 else ''}: {server.address} (Ctrl-C ends)", flush=True)

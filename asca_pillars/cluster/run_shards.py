@@ -11,7 +11,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from asca_pillars.base.errors import ClusterError
 from asca_pillars.base.locks import recover
 from asca_pillars.cluster.ray_pool import RayPool, connected
-from asca_pillars.cluster.shards import Outcome, Result, Shard, cut, process_shards
+from asca_pillars.cluster.shards import Outcome, Result, Shard, make_shards, process_shards
 
 
 def run_shards(
@@ -65,7 +65,7 @@ def run_shards(
             recover(folder)
 
 
-def run_each(
+def run_items(
     job: Callable[[Any], None],
     items: Sequence[Any],
     address: str,
@@ -88,15 +88,15 @@ def run_each(
     if not items:
         return
     lost: list[Any] = []
-    shards = cut(items, shard_size)
+    shards = make_shards(items, shard_size)
     for outcome in run_shards(
-        partial(_each, job), shards, address, seen=seen, folders=folders, title=title, progress=progress
+        partial(_run_shard, job), shards, address, seen=seen, folders=folders, title=title, progress=progress
     ):
         lost += outcome.shard.items if outcome.died else ()
     if lost:
         raise ClusterError(f"{title}: {', '.join(map(str, lost))} ended each process that worked on it")
 
 
-def _each(job: Callable[[Any], None], shard: Shard) -> None:
+def _run_shard(job: Callable[[Any], None], shard: Shard) -> None:
     for item in shard.items:
         job(item)

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Generic, Literal, NamedTuple, Protocol, TypeVar
 
 from asca_pillars.base.errors import OutputError
-from asca_pillars.base.files import atomic_path, sealed, unsealed, write_json
+from asca_pillars.base.files import add_checksum, atomic_path, verify_checksum, write_json
 
 RUN_SETTINGS = "run.json"
 _SUFFIX = ".jsonl"
@@ -28,13 +28,13 @@ class Shard(NamedTuple):
         return f"{self.first:09d}-{hashlib.sha256(json.dumps(self.items).encode()).hexdigest()[:12]}"
 
     @property
-    def halves(self) -> tuple["Shard", "Shard"]:
+    def split(self) -> tuple["Shard", "Shard"]:
         """Two shards of these items; there must be at least two."""
         middle = len(self.items) // 2
         return Shard(self.first, self.items[:middle]), Shard(self.first + middle, self.items[middle:])
 
 
-def cut(items: Sequence[Any], size: int) -> list[Shard]:
+def make_shards(items: Sequence[Any], size: int) -> list[Shard]:
     """Cut items into shards of `size`; the last one holds the rest."""
     return [Shard(first, tuple(items[first : first + size])) for first in range(0, len(items), size)]
 
@@ -85,7 +85,7 @@ class ShardFolder:
     def write(self, shard: Shard, lines: Iterable[str]) -> None:
         """Write a shard's results, a line of JSON with its end for each item; they appear when all are written."""
         with atomic_path(self._file(shard)) as temporary, temporary.open("w", encoding="utf-8", newline="\n") as file:
-            file.writelines(sealed(line[:-1], _key(shard, number)) for number, line in enumerate(lines))
+            file.writelines(add_checksum(line[:-1], _key(shard, number)) for number, line in enumerate(lines))
 
     def join(self, shard: Shard, parts: Sequence[Shard]) -> None:
         """Make the results of a shard from those of its parts, which are removed."""
@@ -125,7 +125,7 @@ class ShardFolder:
         count = 0
         with self._file(shard).open("rb") as file:
             for line in file:
-                text = unsealed(line, _key(shard, count))
+                text = verify_checksum(line, _key(shard, count))
                 if text is None:
                     raise _DamagedError
                 yield text + "\n"
@@ -218,6 +218,6 @@ def process_shards(shards: Iterable[Shard], pool: Pool[Result]) -> Iterator[Outc
             elif outcome.error is not None:
                 raise outcome.error
             elif len(outcome.shard.items) > 1:
-                again.extend(outcome.shard.halves)
+                again.extend(outcome.shard.split)
             else:
                 yield replace(outcome, repeats=repeats[name])

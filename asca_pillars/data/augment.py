@@ -55,7 +55,7 @@ def corrupt_objects(
     return points[kept]
 
 
-def lose_reflectance(points: NDArray[np.float32], config: AugmentConfig, rng: np.random.Generator) -> None:
+def drop_reflectance(points: NDArray[np.float32], config: AugmentConfig, rng: np.random.Generator) -> None:
     """Overwrite the reflectance of some or all points (N, 4), in place, in some samples: some sensors report none.
 
     Half of these samples get 0 for a random share of the points, the other half one value for all.
@@ -108,7 +108,7 @@ def augment(
     frame = replace(frame, points=frame.points.copy(), boxes=frame.boxes.copy())
     move_objects(frame, config, rng)
     frame = replace(frame, points=corrupt_objects(frame.points, frame.boxes, config, rng, sensor_m))
-    lose_reflectance(frame.points, config, rng)
+    drop_reflectance(frame.points, config, rng)
     motion = Motion(
         flipped=rng.random() < config.flip_probability,
         rotation_rad=rng.uniform(-config.rotation_rad, config.rotation_rad),

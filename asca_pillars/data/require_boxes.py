@@ -60,7 +60,7 @@ def require_boxes(split: LabeledSplit, config: Config, *, training: bool, bar: b
     place = f"{split.root}: list `{split.name}`"
     if len(missing) == len(names):
         respelled = any(other_spelling(name, labels.types) for name in names)
-        text = f"{place} has no box of {', '.join(names)}: {_why(missing, labels)}"
+        text = f"{place} has no box of {', '.join(names)}: {_no_boxes_reason(missing, labels)}"
         if training or respelled:
             raise DatasetError(text)
         return [f"{text}; recall cannot be measured"]
@@ -71,7 +71,7 @@ def require_boxes(split: LabeledSplit, config: Config, *, training: bool, bar: b
         )
     warning = check_yaws(labels.yaws)
     cannot = "it cannot be learnt" if training else "its recall cannot be measured"
-    lines = [f"{place} has no box of {name}, {cannot}: {_why([name], labels)}" for name in missing]
+    lines = [f"{place} has no box of {name}, {cannot}: {_no_boxes_reason([name], labels)}" for name in missing]
     return lines if warning is None else [*lines, f"{place}: {warning}"]
 
 
@@ -90,7 +90,7 @@ def _add(labels: _Labels, split: LabeledSplit, frame_id: str, config: Config) ->
         labels.one_with_points = bool((within_ranges(frame, spec.ranges).labels >= 0).any())
 
 
-def _why(names: list[str], labels: _Labels) -> str:
+def _no_boxes_reason(names: list[str], labels: _Labels) -> str:
     spellings = {name: other for name in names if (other := other_spelling(name, labels.types)) is not None}
     if spellings:
         listed = ", ".join(f"'{other}'" for other in spellings.values())

@@ -128,7 +128,7 @@ class ScanCounts:
     """Points inside that the limits dropped."""
 
 
-def summed(counts: Sequence[ScanCounts]) -> ScanCounts:
+def sum_counts(counts: Sequence[ScanCounts]) -> ScanCounts:
     """Sum the counts of a scan's passes, all of one family."""
     first = counts[0]
     return type(first)(**{name.name: sum(getattr(one, name.name) for one in counts) for name in fields(first)})

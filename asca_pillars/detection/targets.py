@@ -71,11 +71,11 @@ def assign_targets(
         assigner: which of both.
         direction_offset_rad: where direction bin 0 begins, see `DetectorSpec`.
     """
-    wanted = np.flatnonzero(labels != IGNORED)
+    box_rows = np.flatnonzero(labels != IGNORED)
     if assigner == "overlap":
-        state, positives, matched = _match_by_overlap(anchors, classes, boxes, labels, wanted)
+        state, positives, matched = _match_by_overlap(anchors, classes, boxes, labels, box_rows)
     else:
-        state, positives, matched = _match_nearest(anchors, boxes, labels, wanted)
+        state, positives, matched = _match_nearest(anchors, boxes, labels, box_rows)
     state[_ignored(anchors, classes, boxes[labels == IGNORED]) & (state == 0)] = -1
     found = anchors.reshape(-1, 7)[positives]
     residuals, directions = encode_boxes(boxes[matched], found, direction_offset_rad)
@@ -95,12 +95,12 @@ def _match_by_overlap(
     classes: Sequence[ClassSpec],
     boxes: NDArray[np.float32],
     labels: NDArray[np.int64],
-    wanted: NDArray[np.int64],
+    box_rows: NDArray[np.int64],
 ) -> _Matches:
     shape = anchors.shape[:3]
     best_iou, best_box = np.zeros(shape), np.full(shape, -1)
     forced: list[tuple[NDArray[np.int64], int]] = []
-    for box_index in wanted:
+    for box_index in box_rows:
         label = labels[box_index]
         window, iou = _overlaps_nearby(anchors, boxes[box_index], classes[label], label)
         closer = iou > best_iou[window]
@@ -123,10 +123,10 @@ def _match_by_overlap(
 
 
 def _match_nearest(
-    anchors: NDArray[np.float32], boxes: NDArray[np.float32], labels: NDArray[np.int64], wanted: NDArray[np.int64]
+    anchors: NDArray[np.float32], boxes: NDArray[np.float32], labels: NDArray[np.int64], box_rows: NDArray[np.int64]
 ) -> _Matches:
     claims = [_Claims(np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0))]
-    claims += [_claims(anchors, boxes[row], labels[row], row) for row in wanted]
+    claims += [_claims(anchors, boxes[row], labels[row], row) for row in box_rows]
     places, claimants, weights = (np.concatenate(parts) for parts in zip(*claims, strict=True))
     order = np.lexsort((weights, places))
     places, claimants = places[order], claimants[order]

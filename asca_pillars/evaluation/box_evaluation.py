@@ -15,11 +15,11 @@ from asca_pillars.evaluation.arguments import Evaluation, EvaluationTask
 from asca_pillars.evaluation.boxes.box_predictions import BoxFrames, read_box_predictions, write_box_predictions
 from asca_pillars.evaluation.boxes.box_report import BoxProtocol, box_json, box_notes, box_report, box_tables
 from asca_pillars.evaluation.boxes.iou_metrics import fixed_scores
-from asca_pillars.evaluation.errors.analysis import prepare_errors, report_errors, who_predicted
+from asca_pillars.evaluation.errors.analysis import predictions_name, prepare_errors, report_errors
 from asca_pillars.evaluation.errors.error_frames import BoxErrorFrames
-from asca_pillars.evaluation.kitti_evaluation import TEXT_SCORE, warn_of_degrees, warn_of_unlike_scans
+from asca_pillars.evaluation.kitti_evaluation import TEXT_SCORE, warn_of_degrees, warn_of_unusual_scans
 from asca_pillars.evaluation.model import Model, OpenModel, model_scores, scores_by_class
-from asca_pillars.evaluation.report_files import MADE_BY, PREDICTIONS_FOLDER, claim, write_report
+from asca_pillars.evaluation.report_files import MADE_BY, PREDICTIONS_FOLDER, check_output_folder, write_report
 from asca_pillars.evaluation.report_page import ReportPage
 
 PREDICTIONS = "detections.jsonl"
@@ -31,7 +31,7 @@ def evaluate_boxes(
     """Evaluate by IoU or by distance; write the tables, the JSON, and the model's predictions."""
     data, predictions = task.data, task.predictions
     assert data is not None, "checked with the arguments"
-    claim(protocol, task.out, task.json, predictions, (task.model, data, *task.beside))
+    check_output_folder(protocol, task.out, task.json, predictions, (task.model, data, *task.beside))
     split = open_split(data, task.split_name)
     about: dict[str, Any] = {"data": str(data), "split": task.split_name}
     if task.around and isinstance(split, BoxSplit) and split.has_camera:
@@ -44,7 +44,7 @@ def evaluate_boxes(
         class_names = model.spec.class_names
         subject, about = f"{model.name} on {data}, {task.split_name}", about | {"model": model.about}
     else:
-        who = who_predicted(predictions)
+        who = predictions_name(predictions)
         analysis = prepare_errors(who, split, task.errors_by, task.beside) if task.errors else None
         frames = read_box_predictions(predictions, split, reporter=reporter)
         class_names = tuple(sorted({kind for frame in frames.frames for kind in frame.found_types}))
@@ -86,7 +86,7 @@ def _run(model: Model, split: LabeledSplit, task: EvaluationTask, reporter: Repo
         )
         about = {"model": model.about, "data": str(split.root), "split": split.name, "files": [PREDICTIONS]}
         write_json(folder / MADE_BY, about)
-    warn_of_unlike_scans(model, len(split.frame_ids), reporter)
+    warn_of_unusual_scans(model, len(split.frame_ids), reporter)
     return read_box_predictions(task.out / "predictions" / PREDICTIONS, split, reporter=reporter)
 
 

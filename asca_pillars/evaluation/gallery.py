@@ -64,7 +64,7 @@ Matches = Sequence[ScoreMatches]
 
 
 @dataclass(frozen=True)
-class Judged:
+class EvaluatedDetector:
     """Detector: its name, the folder of its predictions as KITTI text, and their matches with the labels."""
 
     name: str
@@ -97,7 +97,7 @@ def _difference(first: ScoreMatches, second: ScoreMatches) -> int:
 
 def write_gallery(
     folder: str | Path,
-    detectors: Sequence[Judged],
+    detectors: Sequence[EvaluatedDetector],
     count: int,
     split: KittiSplit,
     labels: str | Path,
@@ -146,7 +146,11 @@ def write_gallery(
 
 
 def _draw(
-    matches: Sequence[ScoreMatches], detectors: Sequence[Judged], split: KittiSplit, labels: Path, ranges: Ranges
+    matches: Sequence[ScoreMatches],
+    detectors: Sequence[EvaluatedDetector],
+    split: KittiSplit,
+    labels: Path,
+    ranges: Ranges,
 ) -> Image:
     frame_id = matches[0].frame_id
     calibration = split.calibration(frame_id)

@@ -22,7 +22,7 @@ from asca_pillars.detection.spec import ScoreThresholds
 from asca_pillars.evaluation import gallery
 from asca_pillars.evaluation.arguments import Evaluation, EvaluationTask
 from asca_pillars.evaluation.curves import write_curves
-from asca_pillars.evaluation.errors.analysis import ErrorAnalysis, prepare_errors, report_errors, who_predicted
+from asca_pillars.evaluation.errors.analysis import ErrorAnalysis, predictions_name, prepare_errors, report_errors
 from asca_pillars.evaluation.errors.error_frames import KittiErrorFrames
 from asca_pillars.evaluation.kitti.average_precision import CLASS_NAMES, DIFFICULTIES, evaluate
 from asca_pillars.evaluation.kitti.kitti_report import BANDS_M, KittiReport, kitti_json, kitti_notes, kitti_tables
@@ -36,7 +36,7 @@ from asca_pillars.evaluation.report_files import (
     GALLERY_FOLDER,
     MADE_BY,
     PREDICTIONS_FOLDER,
-    claim,
+    check_output_folder,
     write_report,
 )
 from asca_pillars.evaluation.report_page import ReportPage
@@ -60,7 +60,7 @@ def evaluate_text(task: EvaluationTask, open_model: OpenModel, reporter: Reporte
     """Evaluate by KITTI's or Waymo's protocol, on KITTI text; write the reports, curves, gallery and predictions."""
     kitti, predictions, labels, out = task.protocol == "kitti", task.predictions, task.labels, task.out
     inputs = (task.model, task.data, labels, task.compare, *task.beside)
-    claim("report" if kitti else task.protocol, out, task.json, predictions, inputs)
+    check_output_folder("report" if kitti else task.protocol, out, task.json, predictions, inputs)
     frames_of = None if task.data is None else KittiSplit(task.data, task.split_name)
     if labels is None:
         assert frames_of is not None, "checked with the arguments"
@@ -70,7 +70,7 @@ def evaluate_text(task: EvaluationTask, open_model: OpenModel, reporter: Reporte
     if predictions is not None:
         if task.errors:
             assert frames_of is not None, "checked with the arguments"
-            analysis = prepare_errors(who_predicted(predictions), frames_of, task.errors_by, task.beside)
+            analysis = prepare_errors(predictions_name(predictions), frames_of, task.errors_by, task.beside)
         compared = text_task(predictions, labels, frames_of, task.score)
     else:
         assert frames_of is not None, "checked with the arguments"
@@ -139,12 +139,12 @@ def kitti_scores(model: Model, score: ScoreThresholds | None, min_score: float) 
     return scores
 
 
-def warn_of_unlike_scans(model: Model, scans: int, reporter: Reporter) -> None:
+def warn_of_unusual_scans(model: Model, scans: int, reporter: Reporter) -> None:
     """Say how many of the scans are not like those of the training, if any."""
-    if model.unlike:
+    if model.input_warnings:
         reporter.remark(
-            f"{len(model.unlike)} of {scans} scans are unlike those that {model.name} was trained on; "
-            f"the first: {model.unlike[0]}"
+            f"{len(model.input_warnings)} of {scans} scans are unlike those that {model.name} was trained on; "
+            f"the first: {model.input_warnings[0]}"
         )
 
 
@@ -173,7 +173,7 @@ def run_model(
         write_predictions(folder, split, model.detect, camera_view=model.camera_view, reporter=reporter)
         files = sorted(path.name for path in folder.iterdir())
         write_json(folder / MADE_BY, about | {"scores": scores, "files": files})
-    warn_of_unlike_scans(model, len(split.frame_ids), reporter)
+    warn_of_unusual_scans(model, len(split.frame_ids), reporter)
     subject = f"{model.name} on {split.root}, {split.name}"
     return Task(subject, out / "predictions", labels, split, model.spec.ranges, scores, about)
 
@@ -250,30 +250,36 @@ def draw_gallery(
     count = GALLERY_FRAMES if count is None else count
     if task.split is None or count == 0:
         return
-    own = gallery.Judged(task.subject, task.predictions, _judged(frames, task.scores))
-    detectors = [own] if compare is None else _named_apart(own, task, _other(compare, task, frames, reporter))
+    own = gallery.EvaluatedDetector(task.subject, task.predictions, _match_at_scores(frames, task.scores))
+    detectors = (
+        [own] if compare is None else _with_distinct_names(own, task, _read_compared(compare, task, frames, reporter))
+    )
     with atomic_directory(out / "gallery", *GALLERY_FOLDER) as folder:
         gallery.write_gallery(folder, detectors, count, task.split, task.labels, task.ranges, reporter=reporter)
 
 
-def _named_apart(own: gallery.Judged, task: Task, other: gallery.Judged) -> list[gallery.Judged]:
+def _with_distinct_names(
+    own: gallery.EvaluatedDetector, task: Task, other: gallery.EvaluatedDetector
+) -> list[gallery.EvaluatedDetector]:
     """Return both detectors named by their models, or by their folders if these are the same."""
-    both = [replace(own, name=_name(task.about, task.predictions)), other]
-    if both[0].name == both[1].name:
-        both = [replace(one, name=f"{one.name}, {one.predictions}") for one in both]
-    return both
+    named = [replace(own, name=_name(task.about, task.predictions)), other]
+    if named[0].name == named[1].name:
+        named = [replace(one, name=f"{one.name}, {one.predictions}") for one in named]
+    return named
 
 
-def _other(compare: Path, task: Task, frames: ScoredFrames, reporter: Reporter) -> gallery.Judged:
+def _read_compared(compare: Path, task: Task, frames: ScoredFrames, reporter: Reporter) -> gallery.EvaluatedDetector:
     """Return the detector of a folder of predictions, at its own scores if an evaluation of it states them."""
     about = _made_by(compare)
     found = read_predictions(compare, frames.truth, task.labels, reporter=reporter)
     if found.shortage is not None:
         reporter.remark(f"--compare {compare}: {found.shortage}")
-    return gallery.Judged(_name(about, compare), compare, _judged(found, task.scores | _stated_scores(about)))
+    return gallery.EvaluatedDetector(
+        _name(about, compare), compare, _match_at_scores(found, task.scores | _stated_scores(about))
+    )
 
 
-def _judged(frames: ScoredFrames, scores: dict[str, float]) -> gallery.Matches:
+def _match_at_scores(frames: ScoredFrames, scores: dict[str, float]) -> gallery.Matches:
     return matches_at_score(frames.truth, frames.detections, CLASS_NAMES, scores=scores)
 
 

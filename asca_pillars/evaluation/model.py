@@ -33,7 +33,7 @@ class Model:
     spec: DetectorSpec
     camera_view: bool
     about: dict[str, Any]
-    unlike: list[str] = field(default_factory=list)
+    input_warnings: list[str] = field(default_factory=list)
 
 
 OpenModel: TypeAlias = Callable[[float | None], Model]

@@ -36,7 +36,7 @@ class ScoredFrames:
         return len(self.truth)
 
     @property
-    def asked(self) -> int:
+    def requested(self) -> int:
         """Number of frames that were to be evaluated."""
         return len(self.truth) + len(self.without_predictions)
 
@@ -45,7 +45,7 @@ class ScoredFrames:
         """Sentence to print with every result if not all frames were evaluated; None if all were."""
         return shortage(len(self), self.without_predictions, "no prediction file", "needs an empty file")
 
-    def titled(self, subject: str) -> str:
+    def title_of(self, subject: str) -> str:
         """Return the subject with the number of its frames, or the missing ones."""
         return f"{subject}: {self.shortage or f'{len(self)} frames'}"
 

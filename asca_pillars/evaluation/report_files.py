@@ -47,7 +47,7 @@ GALLERY_FOLDER = (COMMAND, gallery.INDEX, ending_with(gallery.INDEX_END))
 """Command, marker and recognizer of the folder of pictures."""
 
 
-def claim(
+def check_output_folder(
     name: str,
     out: Path,
     json_path: Path | None,

@@ -388,7 +388,7 @@ class WaymoReport:
     @property
     def title(self) -> str:
         """Subject and number of frames."""
-        return self.frames.titled(self.subject)
+        return self.frames.title_of(self.subject)
 
 
 def waymo_table(report: WaymoReport) -> TextTable:
@@ -421,7 +421,7 @@ def waymo_json(report: WaymoReport) -> dict[str, Any]:
         "protocol": "waymo",
         "subject": report.subject,
         "frames": len(report.frames),
-        "frames_asked": report.frames.asked,
+        "frames_asked": report.frames.requested,
         "frames_without_predictions": list(report.frames.without_predictions),
         "shortage": report.frames.shortage,
         "results": [

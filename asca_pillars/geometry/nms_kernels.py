@@ -9,7 +9,7 @@ import math
 import numpy as np
 from numba import types
 
-from asca_pillars.base.compiling import compiled, given, inner, written
+from asca_pillars.base.compiling import compiled, in_array, inner, out_array
 from asca_pillars.geometry.arrays import Floats, Ints
 
 
@@ -63,8 +63,8 @@ def _shared_area(x: float, y: float, cos: float, sin: float, al: float, aw: floa
 
 
 @compiled(
-    *(given(types.float64, 2), types.float64, types.int64),
-    *(written(types.float64, 2), written(types.float64, 2), written(types.int64)),
+    *(in_array(types.float64, 2), types.float64, types.int64),
+    *(out_array(types.float64, 2), out_array(types.float64, 2), out_array(types.int64)),
 )
 def _nms(boxes: Floats, iou_threshold: float, limit: int, circles: Floats, shapes: Floats, kept: Ints) -> int:
     """Write the indices of kept boxes and return their number.

@@ -40,7 +40,7 @@ def paired_bev_intersection(a: Floats, b: Floats) -> Floats:
         for along, across in ((al, aw), (-al, aw), (-al, -aw), (al, -aw))
     ]
     for start, end in zip(corners, corners[1:] + corners[:1], strict=True):
-        area -= _pressed_integral(start, end, bl, bw)
+        area -= _clamped_integral(start, end, bl, bw)
 
     # Rounding leaves some 1e-16 for disjoint boxes; the separating-axis test is exact.
     return np.where(paired_bev_touch(a, b), np.clip(area, 0.0, 4 * np.minimum(al * aw, bl * bw)), 0.0)
@@ -106,7 +106,7 @@ def _near_pairs(a: Floats, b: Floats) -> tuple[Ints, Ints]:
     return rows, columns
 
 
-def _pressed_integral(start: _Point, end: _Point, x_limit: Floats, y_limit: Floats) -> Floats:
+def _clamped_integral(start: _Point, end: _Point, x_limit: Floats, y_limit: Floats) -> Floats:
     """Return the integral of y dx along K straight edges, x clipped to +-x_limit and y to +-y_limit."""
     (x0, y0), (x1, y1) = start, end
     left, right = np.clip(x0, -x_limit, x_limit), np.clip(x1, -x_limit, x_limit)

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from asca_pillars.geometry.arrays import Floats
 
 
-def of_quaternions(quaternions: NDArray[Any]) -> Floats:
+def rotations_from_quaternions(quaternions: NDArray[Any]) -> Floats:
     """Return rotation matrices (..., 3, 3) of quaternions (..., 4) w, x, y, z; NaN if the norm is 0 or not finite."""
     with np.errstate(over="ignore"):
         lengths = np.linalg.norm(np.asarray(quaternions, np.float64), axis=-1, keepdims=True)
@@ -22,7 +22,7 @@ def of_quaternions(quaternions: NDArray[Any]) -> Floats:
     )
 
 
-def of_roll_pitch_yaw(angles_rad: NDArray[Any]) -> Floats:
+def rotations_from_roll_pitch_yaw(angles_rad: NDArray[Any]) -> Floats:
     """Return rotation matrices (..., 3, 3) of (..., 3): about x by roll, then y by pitch, then z by yaw."""
     angles = np.moveaxis(np.asarray(angles_rad, np.float64), -1, 0)
     (sr, sp, sy), (cr, cp, cy) = np.sin(angles), np.cos(angles)

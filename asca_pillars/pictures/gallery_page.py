@@ -64,13 +64,13 @@ def _button(name: str, *, pressed: bool) -> str:
 def _figure(number: int, card: GalleryCard) -> str:
     source = quote(card.picture.as_posix())
     values = {name: value for name, value in card.values.items() if value == value}
-    said = "".join(f"<span><b>{_number(value)}</b> {_text(name)}</span>" for name, value in values.items())
+    pairs = "".join(f"<span><b>{_number(value)}</b> {_text(name)}</span>" for name, value in values.items())
     chips = "".join(_chip(name, count) for name, count in card.classes.items() if count)
     remarks = "".join(f"<p>{_text(line)}</p>" for line in card.remarks)
     return (
         f'<figure data-order="{number}" data-values="{_text(json.dumps(values))}">'
         f'<a href="{source}"><img src="{source}" loading="lazy" decoding="async" alt="{_text(card.title)}"></a>'
-        f"<figcaption><h2>{_text(card.title)}</h2><div>{chips}</div><div>{said}</div>{remarks}</figcaption></figure>\n"
+        f"<figcaption><h2>{_text(card.title)}</h2><div>{chips}</div><div>{pairs}</div>{remarks}</figcaption></figure>\n"
     )
 
 

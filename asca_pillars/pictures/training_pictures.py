@@ -28,7 +28,7 @@ def draw_training_frames(folder: Path, frames: TrainingFrames, count: int) -> li
         DatasetError, ScanError: a frame cannot be read.
     """
     total = len(frames.frame_ids)
-    said = []
+    lines = []
     for position in range(min(count, total)):
         number = position * total // min(count, total)
         frame, _ = frames.draw(0, number)
@@ -36,8 +36,8 @@ def draw_training_frames(folder: Path, frames: TrainingFrames, count: int) -> li
         name = portable_name(f"{position:02d}_{frame.frame_id}".replace("/", "_"))
         path = folder / f"{name}.png"
         write_png(path, draw_training_frame(frame, frames))
-        said.append(f"{path}: {len(frame.boxes)} boxes{_moved(frame.motion)}")
-    return said
+        lines.append(f"{path}: {len(frame.boxes)} boxes{_motion_text(frame.motion)}")
+    return lines
 
 
 def draw_training_frame(frame: LabeledFrame, frames: TrainingFrames) -> Image:
@@ -52,7 +52,7 @@ def draw_training_frame(frame: LabeledFrame, frames: TrainingFrames) -> Image:
     return draw_layers(frame.points, layers, frames.spec.ranges)
 
 
-def _moved(motion: Motion) -> str:
+def _motion_text(motion: Motion) -> str:
     """Return in words how augmentation moved the frame as a whole."""
     changes = ["mirrored"] if motion.flipped else []
     if motion.rotation_rad:
@@ -79,7 +79,7 @@ def draw_frames(data: Path, split: str, config: Config, count: int, out: Path) -
     config = replace(config, data=replace(config.data, train_set=split))
     frames = open_frames(data, config, training=True)
     with atomic_directory(out, *PICTURES_FOLDER) as folder:
-        said = draw_training_frames(folder, frames, count)
+        lines = draw_training_frames(folder, frames, count)
         about = {"data": str(data), "split": split, "config": config.name}
         write_json(folder / MADE_BY, about | {"files": sorted(path.name for path in folder.iterdir())})
-    return [line.replace(str(folder), str(out)) for line in said]
+    return [line.replace(str(folder), str(out)) for line in lines]

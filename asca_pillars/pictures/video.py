@@ -191,11 +191,11 @@ class BoxVideo:
             self._ground_m = ground_height(heights[np.isfinite(heights)])
         layers = class_layers(found, texts=texts)
         width_px = WIDTH_PX[self._view]
-        shown = {"width_px": width_px, "trails": trails, "ground_m": self._ground_m}
+        options = {"width_px": width_px, "trails": trails, "ground_m": self._ground_m}
         if self._view == "chase":
-            image = draw_chase(points, layers, self._ranges, **shown)  # type: ignore[arg-type]
+            image = draw_chase(points, layers, self._ranges, **options)  # type: ignore[arg-type]
         else:
-            image = draw_layers(points, layers, self._ranges, room_for=_whole(self._ranges), **shown)  # type: ignore[arg-type]
+            image = draw_layers(points, layers, self._ranges, room_for=_whole(self._ranges), **options)  # type: ignore[arg-type]
         self._began_s = time_s if self._began_s is None else self._began_s
         Texts(image, 0.45).put(f"{time_s - self._began_s:.1f} s", [(16, image.shape[0] - 14)], _GRAY)
         return image

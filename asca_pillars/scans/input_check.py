@@ -41,7 +41,7 @@ def check_input(
     counts: ScanCounts,
     expected: ExpectedInput,
     mounting: Mounting | None = None,
-    looks_in: Ranges | None = None,
+    model_ranges: Ranges | None = None,
 ) -> list[InputWarning]:
     """Compare a scan with the training scans, and with where the detector looks.
 
@@ -75,8 +75,8 @@ def check_input(
             "state other axes (--axes)"
         )
         warnings.append(InputWarning("range", text))
-    elif looks_in is not None:
-        warnings.append(_behind_warning(sample[::_FRAME_STEP], looks_in))
+    elif model_ranges is not None:
+        warnings.append(_behind_warning(sample[::_FRAME_STEP], model_ranges))
     return [warning for warning in warnings if warning]
 
 
@@ -137,9 +137,9 @@ def _height_warning(ground: float | None, expected: ExpectedInput, mounting: Mou
     return InputWarning("height", text)
 
 
-def _behind_warning(points: Singles, looks_in: Ranges) -> InputWarning | None:
+def _behind_warning(points: Singles, model_ranges: Ranges) -> InputWarning | None:
     away = points[np.abs(points[:, :2]).max(axis=1) > BODY_M]
-    share = looks_in.behind(away).mean() if len(away) else 0.0
+    share = model_ranges.behind(away).mean() if len(away) else 0.0
     if share < BEHIND_SHARE or np.hypot(*_mean_direction(*away[:, :2].T)) >= _SECTOR_LENGTH:
         return None
     text = f"{share:.0%} of the points lie behind the sensor, where the model does not look: look around (--around)"

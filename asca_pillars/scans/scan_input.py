@@ -23,13 +23,13 @@ class ScanInput:
     def __init__(self, settings: ScanSettings, paths: Sequence[Path]) -> None:
         self._columns = settings.columns
         self._scales: dict[tuple[Path, str], FolderScale] = {}
-        self.said: list[str] = []
+        self.notes: list[str] = []
         stated = settings.reflectance_scale
         for key, group in groupby(sorted(paths, key=_folder_and_suffix), _folder_and_suffix):
             self._scales[key] = self._decide(key[0], list(group)) if stated == "auto" else FolderScale(stated, None)
         self.mounting, estimate = settings.mounting(sample_points(paths, lambda path: self.read(path).points))
         if estimate is not None:
-            self.said.append(f"sensor height: {estimate}")
+            self.notes.append(f"sensor height: {estimate}")
 
     def read(self, path: Path) -> Scan:
         """Read one of the scans.
@@ -46,11 +46,11 @@ class ScanInput:
     def _decide(self, folder: Path, paths: list[Path]) -> FolderScale:
         where = folder if len(paths) > 1 else paths[0]
         decided = folder_reflectance_scale(paths, columns=self._columns)
-        self.said += [f"{where}: {line}" for line in said_of_scale(decided)]
+        self.notes += [f"{where}: {line}" for line in scale_notes(decided)]
         return decided
 
 
-def said_of_scale(decided: FolderScale) -> list[str]:
+def scale_notes(decided: FolderScale) -> list[str]:
     """Return a sentence for the user about a scale that was decided by the values, or none."""
     if decided.scale in (1.0, "auto"):
         return []

@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_pillars.base.errors import ScanError
-from asca_pillars.geometry.rotations import of_quaternions
-from asca_pillars.scans.recordings.messages import decoded
+from asca_pillars.geometry.rotations import rotations_from_quaternions
+from asca_pillars.scans.recordings.messages import decode_message
 from asca_pillars.scans.recordings.recording import Recording, reason
 
 TRANSFORM_TYPES = ("tf2_msgs/msg/TFMessage", "tf2_msgs/TFMessage", "tf/msg/tfMessage", "tf/tfMessage")
@@ -25,7 +25,7 @@ class Transforms:
         for one in message.transforms:
             shift, turn = one.transform.translation, one.transform.rotation
             matrix = np.eye(4)
-            matrix[:3, :3] = of_quaternions(np.array([turn.w, turn.x, turn.y, turn.z]))
+            matrix[:3, :3] = rotations_from_quaternions(np.array([turn.w, turn.x, turn.y, turn.z]))
             matrix[:3, 3] = shift.x, shift.y, shift.z
             if np.isfinite(matrix).all():
                 self._parents[_plain(one.child_frame_id)] = _plain(one.header.frame_id), matrix
@@ -78,7 +78,7 @@ def read_static_transforms(recording: Recording, frame: str) -> Transforms:
     for topic in topics:
         for message in recording.messages(topic):
             try:
-                transforms.add(decoded(message, TRANSFORM_TYPES[0]))
+                transforms.add(decode_message(message, TRANSFORM_TYPES[0]))
             except Exception as error:  # the library does not catch struct's errors
                 trouble = f" ({reason(error)})"
     if _plain(frame) not in transforms.frames:

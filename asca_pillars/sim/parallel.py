@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 from asca_pillars.base.errors import ConfigError, DatasetError
 from asca_pillars.base.files import write_text
 from asca_pillars.base.own_files import json_object, require_no_link, require_own, require_own_file
-from asca_pillars.base.processes import in_processes
+from asca_pillars.base.processes import map_in_processes
 from asca_pillars.base.progress import Progress, Reporter
 from asca_pillars.data.kitti.kitti_split import SIMULATION_FILE
 
@@ -34,7 +34,7 @@ def held_out(count: int, share: float) -> int:
 
 def for_each(job: Callable[[Item], None], todo: Sequence[Item], workers: int, *, progress: bool | Progress) -> None:
     """Do a job for each item, in `workers` processes; the job must be picklable."""
-    done = in_processes(job, todo, workers, "Simulating", progress=progress is True)
+    done = map_in_processes(job, todo, workers, "Simulating", progress=progress is True)
     for _ in done if isinstance(progress, bool) else Reporter(progress).track(done, "Simulating", len(todo)):
         pass
 

@@ -68,14 +68,14 @@ def simulate(
     from asca_pillars.sim.simulation import load_simulation_config, require_own_frames
     from asca_pillars.sim.simulation import simulate as write_frames
 
-    out, told = Path(out), progress or False
+    out, show_progress = Path(out), progress or False
     settings = load_simulation_config(config, view)
     if sequences is not None:
         require_own_sequences(out)
         length = length or LENGTH
-        simulate_sequences(out, sequences, length, seed, workers, settings, val_share=val_share, progress=told)
+        simulate_sequences(out, sequences, length, seed, workers, settings, val_share=val_share, progress=show_progress)
         return Simulated(out, out / "scans", sequences * length)
     frames = frames or FRAMES
     require_own_frames(out)
-    write_frames(out, frames, seed, workers, settings, val_share, cluster is not None or told, cluster=cluster)
+    write_frames(out, frames, seed, workers, settings, val_share, cluster is not None or show_progress, cluster=cluster)
     return Simulated(out, out / "training" / "velodyne", frames)

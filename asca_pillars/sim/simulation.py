@@ -13,7 +13,7 @@ from asca_pillars.base.progress import Progress
 from asca_pillars.base.schema import parse
 from asca_pillars.base.settings import read_settings, shipped_configs
 from asca_pillars.base.strict import Strict
-from asca_pillars.cluster.run_shards import run_each
+from asca_pillars.cluster.run_shards import run_items
 from asca_pillars.data.kitti import (
     Calibration,
     KittiObject,
@@ -193,7 +193,7 @@ def simulate(
     todo = [index for index in range(frames) if not _is_complete(split, index)]
     job = partial(_write_frame, root.absolute(), seed, config)
     if cluster is not None:
-        run_each(
+        run_items(
             job,
             todo,
             cluster,

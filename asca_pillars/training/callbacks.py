@@ -36,7 +36,7 @@ class SaveOnInterrupt(Checkpoint):
 
     def __init__(self, last: LastCheckpoint) -> None:
         self.last = last
-        self.asked = False
+        self.stop_requested = False
         self._before: dict[int, Any] = {}
 
     @contextlib.contextmanager
@@ -45,7 +45,7 @@ class SaveOnInterrupt(Checkpoint):
         if threading.current_thread() is not threading.main_thread():
             yield
             return
-        self._before = {number: signal.signal(number, self._ask) for number in _SIGNALS}
+        self._before = {number: signal.signal(number, self._request_stop) for number in _SIGNALS}
         try:
             yield
         finally:
@@ -54,21 +54,21 @@ class SaveOnInterrupt(Checkpoint):
 
     def on_train_batch_end(self, trainer: L.Trainer, pl_module: L.LightningModule, *_: Any) -> None:
         """Save and stop, on all ranks together."""
-        if self._any_rank_asked(trainer):
+        if self._any_rank_requested_stop(trainer):
             self.last.save(trainer)
             self._stop(trainer)
 
     def on_validation_batch_end(self, trainer: L.Trainer, pl_module: L.LightningModule, *_: Any) -> None:
         """Stop: the epoch was saved before its validation."""
-        if not trainer.sanity_checking and self._any_rank_asked(trainer):
+        if not trainer.sanity_checking and self._any_rank_requested_stop(trainer):
             self._stop(trainer)
 
-    def _ask(self, number: int, *_: Any) -> None:
-        self.asked = True
+    def _request_stop(self, number: int, *_: Any) -> None:
+        self.stop_requested = True
         signal.signal(number, self._before[number])
 
-    def _any_rank_asked(self, trainer: L.Trainer) -> bool:
-        return trainer.strategy.reduce_boolean_decision(self.asked, all=False)
+    def _any_rank_requested_stop(self, trainer: L.Trainer) -> bool:
+        return trainer.strategy.reduce_boolean_decision(self.stop_requested, all=False)
 
     def _stop(self, trainer: L.Trainer) -> None:
         raise TrainingInterruptedError(f"interrupted and saved at step {trainer.global_step}; the same command goes on")
@@ -179,13 +179,13 @@ class StepProgress(RankProgress):
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Set the length of the run."""
         self._total = (trainer.max_epochs or 0) * pl_module.steps_per_epoch()  # type: ignore[operator]
-        self._tell(trainer)
+        self._report_step(trainer)
 
     def on_train_batch_end(self, trainer: L.Trainer, pl_module: L.LightningModule, *_: Any) -> None:
         """Advance by one step."""
-        self._tell(trainer)
+        self._report_step(trainer)
 
-    def _tell(self, trainer: L.Trainer) -> None:
+    def _report_step(self, trainer: L.Trainer) -> None:
         if self._progress is not None and self._enabled:
             self._progress("Training", trainer.global_step, self._total)
 

@@ -124,7 +124,7 @@ def checkpoint_to_resume(folder: Path, model: ModelConfig) -> tuple[Path | None,
         if not path.exists():
             continue
         require_content(path, TrainingError)
-        if (reason := _why_unusable(path, model)) is None:
+        if (reason := _unusable_reason(path, model)) is None:
             return path, unusable[0] if unusable else None
         unusable.append(f"{path} {reason}")
         weights = path if reason == _WEIGHTS_ALONE else weights
@@ -136,7 +136,7 @@ def checkpoint_to_resume(folder: Path, model: ModelConfig) -> tuple[Path | None,
     return None, None
 
 
-def _why_unusable(path: Path, model: ModelConfig) -> str | None:
+def _unusable_reason(path: Path, model: ModelConfig) -> str | None:
     """Return why a run of this model cannot resume from the checkpoint; None if it can."""
     try:
         content = read_plain(path)
@@ -149,9 +149,9 @@ def _why_unusable(path: Path, model: ModelConfig) -> str | None:
     for name, kind in _OF_A_RUN.items():
         if not isinstance(content[name], kind):
             return f"is damaged (`{name}` is a {type(content[name]).__name__})"
-    wanted = {f"detector.{name}": array.shape for name, array in build_model(model).state_dict().items()}
+    expected = {f"detector.{name}": array.shape for name, array in build_model(model).state_dict().items()}
     found = {name: getattr(array, "shape", None) for name, array in content["state_dict"].items()}
-    if wrong := [name for name in wanted if found.get(name) != wanted[name]]:
+    if wrong := [name for name in expected if found.get(name) != expected[name]]:
         return f"is of another network ({wrong[0].removeprefix('detector.')} differs)"
     return None
 
@@ -192,10 +192,10 @@ def initial_weights(config: Config, init: Path | None) -> dict[str, Any]:
         for weights in (load_checkpoint(init).detector.state_dict(), build_model(config.model).state_dict())
     )
     for name in ours | theirs:
-        found, wanted = (tuple(each[name].shape) if name in each else "missing" for each in (theirs, ours))
-        if found != wanted:
+        found, expected = (tuple(each[name].shape) if name in each else "missing" for each in (theirs, ours))
+        if found != expected:
             raise TrainingError(
-                f"{init}: weights of another network: {name} is {found} there and {wanted} in this configuration; "
+                f"{init}: weights of another network: {name} is {found} there and {expected} in this configuration; "
                 "model.spec and model.network have to be like those that it was trained with"
             )
     return theirs

@@ -38,9 +38,9 @@ from asca_pillars.training.checkpoints import (
     steps_of,
 )
 from asca_pillars.training.loaders import DetectionData
-from asca_pillars.training.module import DetectionModule, has_bfloat16, settled
+from asca_pillars.training.module import DetectionModule, has_bfloat16, resolve_precision
 from asca_pillars.training.run_files import COMMAND
-from asca_pillars.training.run_folder import Seen, claim, measure_input, recorded_precision
+from asca_pillars.training.run_folder import TrainingInputs, claim_run_folder, measure_input, recorded_precision
 
 SANITY_STEPS = 2  # validation batches that run before the first training step
 
@@ -112,7 +112,7 @@ def _train(
     recover(checkpoints)
     resumed, damage = checkpoint_to_resume(checkpoints, config.model)
     goes_on = resumed is not None
-    config = replace(config, train=_with_settled_precision(config.train, out, resumes=goes_on))
+    config = replace(config, train=_with_resolved_precision(config.train, out, resumes=goes_on))
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
     # Arguments are checked before minutes of work, and before the folder is claimed for this run.
     weights = None if goes_on and init is None else initial_weights(config, init)
@@ -128,7 +128,8 @@ def _train(
         for warning in require_boxes(split, config, training=training, bar=remark is None):
             say(warning)
     data = DetectionData(config, data_root)
-    claim(out, config, Seen.of(data.training_set.frames.split, trainer.world_size, weights), steps_of(resumed))
+    inputs = TrainingInputs.of(data.training_set.frames.split, trainer.world_size, weights)
+    claim_run_folder(out, config, inputs, steps_of(resumed))
     if damage is not None and goes_on:
         say(f"{damage}: going on from {resumed}")
     if config.train.precision == "bf16" and not has_bfloat16():
@@ -170,11 +171,11 @@ def syncs_statistics(model: ModelConfig) -> bool:
     return torch.cuda.is_available() and isinstance(model, PillarModel)
 
 
-def _with_settled_precision(recipe: TrainConfig, out: Path, *, resumes: bool) -> TrainConfig:
+def _with_resolved_precision(recipe: TrainConfig, out: Path, *, resumes: bool) -> TrainConfig:
     """Resolve `auto` to the precision of the run in `out`, so that it resumes exactly, or to what suits the device."""
     auto = recipe.precision == "auto"
     precision = recorded_precision(out) if auto and resumes else recipe.precision
-    return replace(recipe, precision=settled(precision))
+    return replace(recipe, precision=resolve_precision(precision))
 
 
 def _trainer(

@@ -169,7 +169,7 @@ def has_bfloat16(device: str | None = None) -> bool:
     return bool(torch.ops.mkldnn._is_mkldnn_bf16_supported())  # oneDNN's own answer, which has no public name
 
 
-def settled(precision: Precision, device: str | None = None) -> Precision:
+def resolve_precision(precision: Precision, device: str | None = None) -> Precision:
     """Resolve `auto` to what suits a device; other values stay, see `has_bfloat16`."""
     if precision != "auto":
         return precision

@@ -39,7 +39,7 @@ EXPECTED_INPUT_FRAMES = 200
 NOT_OF_THE_RUN = ("data.workers", "data.prepared", "train.checkpoint_steps")
 
 
-class Seen(NamedTuple):
+class TrainingInputs(NamedTuple):
     """Inputs of a run besides configuration and seed: frames, processes and initial weights."""
 
     frames: int
@@ -50,7 +50,7 @@ class Seen(NamedTuple):
     """SHA-256 of the initial weights; empty for random ones, None where it is not known."""
 
     @classmethod
-    def of(cls, split: LabeledSplit, processes: int, initial: Mapping[str, Tensor] | None = None) -> "Seen":
+    def of(cls, split: LabeledSplit, processes: int, initial: Mapping[str, Tensor] | None = None) -> "TrainingInputs":
         """Return the inputs of a run on these frames.
 
         Args:
@@ -66,7 +66,7 @@ class Seen(NamedTuple):
         return cls(len(sizes), hashlib.sha256("\n".join(sizes).encode()).hexdigest(), processes, start)
 
 
-def claim(out: Path, config: Config, seen: Seen, steps: int = 0) -> None:
+def claim_run_folder(out: Path, config: Config, inputs: TrainingInputs, steps: int = 0) -> None:
     """Write what this run is into `out`, or make sure that the run found there is the same one.
 
     A run may be made longer where its steps so far are those of the longer run: always with the `step` schedule, and
@@ -75,7 +75,7 @@ def claim(out: Path, config: Config, seen: Seen, steps: int = 0) -> None:
     Args:
         out: folder of the run.
         config: of the run.
-        seen: its frames, processes and first weights.
+        inputs: its frames, processes and first weights.
         steps: optimizer steps of the run that is there.
 
     Raises:
@@ -85,17 +85,17 @@ def claim(out: Path, config: Config, seen: Seen, steps: int = 0) -> None:
     """
     path, frames_path = out / CONFIG_FILE, out / FRAMES_FILE
     require_own_file(path, COMMAND, is_own_config)
-    found = read_settings(Seen, frames_path, (), {}) if frames_path.exists() else None
-    refusal = _why_another(path, config, seen, steps) if path.exists() else None
-    refusal = refusal or (found and _why_other_frames(frames_path, found, seen))
+    found = read_settings(TrainingInputs, frames_path, (), {}) if frames_path.exists() else None
+    refusal = _other_run_reason(path, config, inputs, steps) if path.exists() else None
+    refusal = refusal or (found and _other_inputs_reason(frames_path, found, inputs))
     if refusal and any((out / "checkpoints").glob("*.ckpt")):
         raise TrainingError(refusal)
-    if seen.initial_sha256 is None and found is not None:
-        seen = seen._replace(initial_sha256=found.initial_sha256)
+    if inputs.initial_sha256 is None and found is not None:
+        inputs = inputs._replace(initial_sha256=found.initial_sha256)
     if refusal or not path.exists():
         write_json(out / ENVIRONMENT_FILE, describe_environment())
     write_text(path, YAML_HEAD + yaml.safe_dump(to_dict(config), sort_keys=False))
-    write_json(frames_path, seen._asdict())
+    write_json(frames_path, inputs._asdict())
 
 
 def recorded_precision(out: Path) -> Precision:
@@ -131,7 +131,7 @@ def measure_input(out: Path, frames: TrainingFrames, *, keep: bool, bar: bool = 
     return measured
 
 
-def _why_another(path: Path, config: Config, seen: Seen, steps: int) -> str | None:
+def _other_run_reason(path: Path, config: Config, inputs: TrainingInputs, steps: int) -> str | None:
     """Return in words how `config` differs from the run that `path` is of; None if it is the same run, or longer."""
     found_config = load_config(path)  # a run of an older version lacks keys that are younger, not their values
     found = to_dict(found_config)
@@ -139,7 +139,7 @@ def _why_another(path: Path, config: Config, seen: Seen, steps: int) -> str | No
         found["train"]["precision"] = config.train.precision
     longer = config.train.epochs > found_config.train.epochs
     recipe = found_config.train
-    planned = recipe.epochs * steps_per_epoch(recipe, seen.frames, seen.processes)
+    planned = recipe.epochs * steps_per_epoch(recipe, inputs.frames, inputs.processes)
     extendable = recipe.schedule == "step" or (
         recipe.schedule == "warmup_stable_decay" and steps <= cooldown_start(recipe, planned)
     )
@@ -161,19 +161,19 @@ def _why_another(path: Path, config: Config, seen: Seen, steps: int) -> str | No
     return f"{path}: the run there was started with {difference}; choose another --out, or delete it"
 
 
-def _why_other_frames(path: Path, found: Seen, seen: Seen) -> str | None:
-    """Return in words how `seen` differs from that of the run in `path`; None if it does not."""
-    if found.processes != seen.processes:
+def _other_inputs_reason(path: Path, found: TrainingInputs, inputs: TrainingInputs) -> str | None:
+    """Return in words how `inputs` differs from that of the run in `path`; None if it does not."""
+    if found.processes != inputs.processes:
         return (
-            f"{path}: the run there was started with {found.processes} process(es), now {seen.processes}: its steps "
+            f"{path}: the run there was started with {found.processes} process(es), now {inputs.processes}: its steps "
             "would be others; give as many --devices, or start a new run in another --out with --init"
         )
-    if found[:2] != seen[:2]:
+    if found[:2] != inputs[:2]:
         return (
-            f"{path}: the run there was started on {found.frames} frames, now there are {seen.frames}, or others; give "
-            "it the same --data and data.train_set, or start a new run in another --out with --init"
+            f"{path}: the run there was started on {found.frames} frames, now there are {inputs.frames}, or others; "
+            "give it the same --data and data.train_set, or start a new run in another --out with --init"
         )
-    if None not in (found.initial_sha256, seen.initial_sha256) and found.initial_sha256 != seen.initial_sha256:
+    if None not in (found.initial_sha256, inputs.initial_sha256) and found.initial_sha256 != inputs.initial_sha256:
         return (
             f"{path}: the run there was started from {'other' if found.initial_sha256 else 'random'} weights; leave "
             "--init out to go on with it, or start a new run in another --out"
@@ -181,12 +181,12 @@ def _why_other_frames(path: Path, found: Seen, seen: Seen) -> str | None:
     return None
 
 
-def _first_difference(found: Any, wanted: Any, key: str = "") -> str | None:
+def _first_difference(found: Any, expected: Any, key: str = "") -> str | None:
     if key in NOT_OF_THE_RUN:
         return None
-    if isinstance(found, dict) and isinstance(wanted, dict):
-        for name in wanted | found:
-            if difference := _first_difference(found.get(name), wanted.get(name), f"{key}.{name}".lstrip(".")):
+    if isinstance(found, dict) and isinstance(expected, dict):
+        for name in expected | found:
+            if difference := _first_difference(found.get(name), expected.get(name), f"{key}.{name}".lstrip(".")):
                 return difference
         return None
-    return None if found == wanted else f"{key} = {found}, now {key} = {wanted}"
+    return None if found == expected else f"{key} = {found}, now {key} = {expected}"

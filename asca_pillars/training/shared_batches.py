@@ -122,12 +122,12 @@ def loader_context() -> ForkServerContext:
 
 def start_loader_process(_: int) -> None:
     """Set up a loader process before its first batch."""
-    leave_interrupts_to_the_loop()
+    ignore_interrupts()
     # Else the batch would be lost, and the loop would wait for it forever: it notices a process that has ended.
     Queue._on_queue_feeder_error = staticmethod(_end)  # type: ignore[attr-defined]
 
 
-def leave_interrupts_to_the_loop() -> None:
+def ignore_interrupts() -> None:
     """Ignore Ctrl-C and the first SIGTERM, which reach every process, in favor of the training loop.
 
     A step that is under way still needs its batch. A second SIGTERM ends the process: it is the loader's own.

@@ -50,6 +50,6 @@ def train(
     from asca_pillars.training.callbacks import RunProgress, StepProgress
     from asca_pillars.training.loop import train as run
 
-    told = None if bar else remark or (lambda _: None)
-    shown = RunProgress() if told is None else StepProgress(progress, told)
-    return run(settings, data, out, devices=devices, num_nodes=num_nodes, init=init, bar=shown, remark=told)
+    remark_line = None if bar else remark or (lambda _: None)
+    reporter = RunProgress() if remark_line is None else StepProgress(progress, remark_line)
+    return run(settings, data, out, devices=devices, num_nodes=num_nodes, init=init, bar=reporter, remark=remark_line)

@@ -1,7 +1,7 @@
 """Detection in every direction with a model that looks ahead: one pass with wider ranges, or several turned ones.
 
 A sparse neck's graphs hold no ranges, so that a bundle trained on whole revolutions is run with wider ones
-(`widened`). With others the scan is turned before each pass, and the boxes are turned back:
+(`widen_ranges`). With others the scan is turned before each pass, and the boxes are turned back:
 
     pass 0: ahead     pass 1: left     pass 2: behind     pass 3: right
 
@@ -38,7 +38,7 @@ _HALF_TURN_RAD = math.pi
 _STEP_RAD = math.radians(1)
 
 
-def widened(bundle: Bundle) -> Bundle:
+def widen_ranges(bundle: Bundle) -> Bundle:
     """Return the bundle with ranges widened in every direction to its farthest reach, where its graphs allow it.
 
     That requires a sparse neck, which reads rulebooks instead of a map, pillars of one size, and weights trained on

@@ -96,10 +96,10 @@ def choose(
     for name in names:
         if name == REFERENCE or precision not in (None, name[1]):
             continue
-        if reason := _left_out(name[0], clock() - start):
+        if reason := _skip_reason(name[0], clock() - start):
             candidates.append(Candidate(*name, None, reason, weights))
             continue
-        trial = _try(name, open_network, detect, expected, spec, clock)
+        trial = _measure_candidate(name, open_network, detect, expected, spec, clock)
         trial = trial._replace(candidate=replace(trial.candidate, weights=weights))
         candidates.append(trial.candidate)
         if trial.network is not None and (best is None or _cost(trial.candidate) < _cost(best[0])):
@@ -121,10 +121,10 @@ def disagreement(expected: Detections, found: Detections, spec: DetectorSpec) ->
     Partners have the same class and are as near as the limits above demand. A box whose score ties with its class's
     threshold needs none. Without any box above its threshold, nothing agrees.
     """
-    if not (~_ties(expected, spec)).any():
+    if not (~_are_score_ties(expected, spec)).any():
         return "unproven, the sample scan shows no clear object with this model"
     for boxes, partners, what in ((expected, found, "misses"), (found, expected, "invents")):
-        lone = np.flatnonzero(~_have_partners(boxes, partners) & ~_ties(boxes, spec))
+        lone = np.flatnonzero(~_have_matches(boxes, partners) & ~_are_score_ties(boxes, spec))
         for index in lone[:1]:
             x_m, y_m = boxes.boxes[index, :2]
             return f"{what} a {boxes.names[index]} of score {boxes.scores[index]:.2f} at x = {x_m:.1f}, y = {y_m:.1f} m"
@@ -137,7 +137,7 @@ class _Trial(NamedTuple, Generic[Network]):
     """None unless it agrees with the reference."""
 
 
-def _try(
+def _measure_candidate(
     name: tuple[Provider, Precision],
     open_network: Callable[[Provider, Precision], Network],
     detect: Callable[[Network], Detections],
@@ -154,7 +154,7 @@ def _try(
         return _Trial(Candidate(*name, None, f"does not run: {first_line(error)}"), None)
 
 
-def _left_out(provider: str, elapsed_s: float) -> str | None:
+def _skip_reason(provider: str, elapsed_s: float) -> str | None:
     if provider in SLOW_START:
         return "left out, it takes up to minutes to start: ask for it by name"
     return f"not tried, {BUDGET_S:g} s were over: ask for it by name" if elapsed_s > BUDGET_S else None
@@ -175,13 +175,13 @@ def _cost(candidate: Candidate) -> float:
     return candidate.median_ms * (REDUCED_MUST_GAIN if candidate.precision == "reduced" else 1.0)
 
 
-def _have_partners(boxes: Detections, partners: Detections) -> NDArray[np.bool_]:
+def _have_matches(boxes: Detections, partners: Detections) -> NDArray[np.bool_]:
     same = boxes.labels[:, None] == partners.labels[None]
     same &= np.abs(boxes.scores[:, None] - partners.scores[None]) <= MAX_SCORE_DIFFERENCE
     same &= np.abs(wrap_angle(boxes.boxes[:, None, 6] - partners.boxes[None, :, 6])) <= MAX_YAW_DIFFERENCE_RAD
     return (same & (iou_3d(boxes.boxes, partners.boxes) >= MIN_IOU)).any(axis=1)
 
 
-def _ties(boxes: Detections, spec: DetectorSpec) -> NDArray[np.bool_]:
+def _are_score_ties(boxes: Detections, spec: DetectorSpec) -> NDArray[np.bool_]:
     thresholds = np.array([class_.score_threshold for class_ in spec.classes])
     return boxes.scores - thresholds[boxes.labels] <= MAX_SCORE_DIFFERENCE

@@ -176,12 +176,12 @@ def _open_package(path: Path) -> tuple[str, Callable[[str], bytes]]:
 
 
 def _unpacked(path: Path) -> dict[str, bytes]:
-    wanted = {f"package/{name}" for name in ("package.json", *(f"dist/{n}" for n in ORT_FILES))}
+    needed = {f"package/{name}" for name in ("package.json", *(f"dist/{n}" for n in ORT_FILES))}
     files = {}
     with tarfile.open(path) as archive:
         for member in archive:
-            if member.name in wanted and (stream := archive.extractfile(member)) is not None:
+            if member.name in needed and (stream := archive.extractfile(member)) is not None:
                 files[member.name.removeprefix("package/")] = stream.read()
-    if missing := wanted - {f"package/{name}" for name in files}:
+    if missing := needed - {f"package/{name}" for name in files}:
         raise KeyError(min(missing))
     return files

@@ -20,8 +20,8 @@ from asca_deploy.result_files import (
     RUN_FILE,
     UNREADABLE_FILE,
     as_line,
-    claim,
     remove_companions,
+    require_own_results,
     scan_content,
 )
 from asca_deploy.shipped import find_bundle
@@ -33,7 +33,7 @@ from asca_pillars.base.progress import Progress, Remark, Reporter
 from asca_pillars.base.schema import to_dict
 from asca_pillars.base.system import package_versions
 from asca_pillars.cluster.run_shards import run_shards
-from asca_pillars.cluster.shards import RUN_SETTINGS, Shard, ShardFolder, cut
+from asca_pillars.cluster.shards import RUN_SETTINGS, Shard, ShardFolder, make_shards
 from asca_pillars.data.boxes.detector_scope import detector_scope
 from asca_pillars.detection.spec import ScoreThresholds
 from asca_pillars.scans.mounting import Mounting
@@ -51,7 +51,7 @@ READ_AGAIN_AFTER_S = (1.0, 5.0)
 _ERROR = '{"error": '
 
 
-class Counts(NamedTuple):
+class ArchiveCounts(NamedTuple):
     """Scans with results, and scans that could not be read."""
 
     detected: int
@@ -68,7 +68,7 @@ class ArchiveResult:
         repeats: how often shards were begun again after their worker had died.
     """
 
-    counts: Counts
+    counts: ArchiveCounts
     done_before: int
     repeats: int
 
@@ -172,26 +172,26 @@ def detect_archive(
     if options.provider == "auto":
         raise ConfigError("--provider auto: each machine would choose its own; name one provider with --cluster")
     is_run = json_object("shard_size", "settings")
-    claim(out, {f"{SHARDS}/{RUN_SETTINGS}": is_run})
+    require_own_results(out, {f"{SHARDS}/{RUN_SETTINGS}": is_run})
     require_own(out / SHARDS, COMMAND, {RUN_SETTINGS: is_run})
-    for line in scan_input.said:
+    for line in scan_input.notes:
         reporter.remark(line)
     job = _job(scan_input.mounting, reading.columns, options, out, score=score, around=around)
     folder = ShardFolder(job.shards)
-    wanted = min(max(len(scans) // _SHARDS_WANTED, _SHARD_SCANS[0]), _SHARD_SCANS[1])
-    size = folder.begin(_results_depend_on(job, scans), wanted)
-    shards = cut([(str(path), scan_input.scale(path)) for path in scans], size)
+    shard_size = min(max(len(scans) // _SHARDS_WANTED, _SHARD_SCANS[0]), _SHARD_SCANS[1])
+    size = folder.begin(_results_depend_on(job, scans), shard_size)
+    shards = make_shards([(str(path), scan_input.scale(path)) for path in scans], size)
     there = folder.done(reporter.track(shards, "Checking what is done"))
     todo = [shard for shard in shards if shard.name not in there]
     done = len(scans) - sum(len(shard.items) for shard in todo)
-    repeats = _work(job, folder, todo, done, address)
+    repeats = _process(job, folder, todo, done, address)
     counts = merge(folder.lines(shards), out)
     if not counts.detected:
         raise ScanError(f"none of the {len(scans)} scans can be read; the reasons are in {out / UNREADABLE_FILE}")
     return ArchiveResult(counts, done, repeats)
 
 
-def merge(lines: Iterable[str], out: Path) -> Counts:
+def merge(lines: Iterable[str], out: Path) -> ArchiveCounts:
     """Part the lines of all shards into results and scans that could not be read, and write the two files."""
     detected = unreadable = 0
     with (
@@ -208,10 +208,10 @@ def merge(lines: Iterable[str], out: Path) -> Counts:
                 detected += 1
                 results.write(line)
     remove_companions(out, [UNREADABLE_FILE])
-    return Counts(detected, unreadable)
+    return ArchiveCounts(detected, unreadable)
 
 
-def _work(job: DetectShard, folder: ShardFolder, todo: Sequence[Shard], done: int, address: str) -> int:
+def _process(job: DetectShard, folder: ShardFolder, todo: Sequence[Shard], done: int, address: str) -> int:
     """Process the shards; return how often one was restarted."""
     if not todo:
         return 0

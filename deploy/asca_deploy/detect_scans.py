@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from asca_deploy.detector import Detector
 from asca_deploy.open_model import RuntimeOptions, open_detector, track_thresholds
-from asca_deploy.recordings.results import Found
+from asca_deploy.recordings.results import FrameResult
 from asca_deploy.recordings.sequence_files import SequenceFiles
 from asca_deploy.result_files import ResultWriter
 from asca_deploy.scan_detections import ScanDetections
@@ -167,7 +167,7 @@ def detect_scans(
                 tracks = tracker(detections, times_ns[number] * 1e-9)
                 detections = cast("ScanDetections", tracks.detections)  # a part of these
             results.append(DetectedScan(path, scan.notes, detections, tracks))
-            found = Found(number, times_ns[number], FRAME_ID, detections, tracks)
+            found = FrameResult(number, times_ns[number], FRAME_ID, detections, tracks)
             for file in opened:
                 file.write(found, scan.points)
             try:
@@ -180,7 +180,7 @@ def detect_scans(
         if not results:
             raise ScanError(f"none of the {len(named)} scans can be read")
         handles.close()  # before the names are changed
-    remarks = (*scan_input.said, *repairs(results), *([] if writer is None else writer.remarks[:1]))
+    remarks = (*scan_input.notes, *repairs(results), *([] if writer is None else writer.remarks[:1]))
     return DetectedScans(tuple(results), detector, tuple(reporter.remarks), unreadable, scan.points, remarks)
 
 

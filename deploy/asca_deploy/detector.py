@@ -12,20 +12,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_deploy import auto, providers
-from asca_deploy.around import about_ground, merge, ranges_around, turns_around, widened
+from asca_deploy.around import about_ground, merge, ranges_around, turns_around, widen_ranges
 from asca_deploy.bundle import Bundle, weights_digest
 from asca_deploy.manifest import load_bundle
 from asca_deploy.open_pipeline import open_pipeline
 from asca_deploy.ort_session import check_onnxruntime
-from asca_deploy.pipeline import Laps
+from asca_deploy.pipeline import StageTimes
 from asca_deploy.scan_detections import ScanDetections
 from asca_deploy.shipped import find_bundle
-from asca_deploy.stream import overlapped
+from asca_deploy.stream import overlap_stages
 from asca_pillars.base.errors import ConfigError, ScanError
 from asca_pillars.base.kernels import load_kernels
 from asca_pillars.base.system import check_threads, own_version
 from asca_pillars.detection import decode
-from asca_pillars.detection.detections import FrameReport, ScanCounts, summed
+from asca_pillars.detection.detections import FrameReport, ScanCounts, sum_counts
 from asca_pillars.geometry.frame_change import FrameChange
 from asca_pillars.scans.input_check import InputWarning, check_input
 from asca_pillars.scans.mounting import Mounting
@@ -53,7 +53,7 @@ class _Frame(NamedTuple):
     """State of a scan between its points and its boxes."""
 
     start: float
-    laps: Laps
+    stage_times: StageTimes
     usable: UsablePoints
     """Points in the model's frame."""
     turns: tuple[FrameChange, ...]
@@ -115,7 +115,7 @@ class Detector:
         if view not in get_args(View):
             raise ConfigError(f"view {view}: give {' or '.join(get_args(View))}")
         manifest = load_bundle(self.folder)
-        self.bundle: Bundle = widened(manifest) if view == "around" else manifest
+        self.bundle: Bundle = widen_ranges(manifest) if view == "around" else manifest
         spec = self.bundle.spec
         self.spec = spec if score_threshold is None else spec.with_score_threshold(score_threshold)
         self.pipeline, self.provider, self.precision, self.candidates = open_pipeline(
@@ -167,10 +167,10 @@ class Detector:
         drawn[:, :3] = bounds[:, 0] + drawn[:, :3] * (bounds[:, 1] - bounds[:, 0])
         took_ms = 0.0
         for _ in range(scans):
-            start, laps = perf_counter(), [("input", perf_counter())]
+            start, stage_times = perf_counter(), [("input", perf_counter())]
             for turn in self._turns:
-                prepared = self.pipeline.prepare(turn.points(drawn), laps)
-                self.pipeline.finish(self.pipeline.infer(prepared, laps), laps)
+                prepared = self.pipeline.prepare(turn.points(drawn), stage_times)
+                self.pipeline.finish(self.pipeline.infer(prepared, stage_times), stage_times)
             took_ms = (perf_counter() - start) * 1e3
         return took_ms
 
@@ -197,7 +197,7 @@ class Detector:
         """
         frame = self._open(points)
         # Pass by pass, so that all of them need no more than one pseudo-image.
-        raw = [self.pipeline.infer(self._prepare(frame, turn), frame.laps) for turn in frame.turns]
+        raw = [self.pipeline.infer(self._prepare(frame, turn), frame.stage_times) for turn in frame.turns]
         return self._finish(frame, raw)
 
     def stream(self, scans: Iterable[NDArray[Any]]) -> Generator[ScanDetections, None, None]:
@@ -220,15 +220,15 @@ class Detector:
 
         def infer(ready: tuple[_Frame, list[Any]]) -> tuple[_Frame, list[Any]]:
             frame, prepared = ready
-            frame.laps.append((_WAITING, perf_counter()))
-            return frame, [self.pipeline.infer(one, frame.laps) for one in prepared]
+            frame.stage_times.append((_WAITING, perf_counter()))
+            return frame, [self.pipeline.infer(one, frame.stage_times) for one in prepared]
 
         def finish(found: tuple[_Frame, list[Any]]) -> ScanDetections:
             frame, raw = found
-            frame.laps.append((_WAITING, perf_counter()))
+            frame.stage_times.append((_WAITING, perf_counter()))
             return self._finish(frame, raw)
 
-        return overlapped(scans, prepare, infer, finish)
+        return overlap_stages(scans, prepare, infer, finish)
 
     def _open(self, points: NDArray[Any]) -> _Frame:
         """Return the usable points in the model's frame."""
@@ -244,25 +244,25 @@ class Detector:
     def _prepare(self, frame: _Frame, turn: FrameChange) -> Any:
         """Prepare one pass for the slowest network; in the first pass, check the scan against the expected input."""
         points = frame.usable.points if turn.is_identity else turn.points(frame.usable.points)
-        frame.laps.append(("input", perf_counter()))
-        prepared = self.pipeline.prepare(points, frame.laps)
+        frame.stage_times.append(("input", perf_counter()))
+        prepared = self.pipeline.prepare(points, frame.stage_times)
         if not frame.counts:
-            expected, looks_in = self.bundle.expected_input, self.spec.ranges if self.view == "ahead" else None
-            found = check_input(frame.usable.unclipped, prepared.counts, expected, self.mounting, looks_in)
+            expected, model_ranges = self.bundle.expected_input, self.spec.ranges if self.view == "ahead" else None
+            found = check_input(frame.usable.unclipped, prepared.counts, expected, self.mounting, model_ranges)
             frame.warnings[:0] = found
-            frame.laps.append(("input", perf_counter()))
+            frame.stage_times.append(("input", perf_counter()))
         frame.counts.append(prepared.counts)
         return prepared
 
     def _finish(self, frame: _Frame, raw: list[Any]) -> ScanDetections:
-        found = [self.pipeline.finish(one, frame.laps) for one in raw]
+        found = [self.pipeline.finish(one, frame.stage_times) for one in raw]
         if self.passes == 1:
             detections, counts = found[0], frame.counts[0]
         else:
-            detections, counts = merge(found, frame.turns, self.spec.post.nms_iou), summed(frame.counts)
+            detections, counts = merge(found, frame.turns, self.spec.post.nms_iou), sum_counts(frame.counts)
         if not self._to_model.is_identity:
             detections = replace(detections, boxes=self._to_model.inverse.boxes(detections.boxes))
-        frame.laps.append((self.pipeline.stages[-1], perf_counter()))
+        frame.stage_times.append((self.pipeline.stages[-1], perf_counter()))
         if frame.usable.non_finite:
             text = f"{frame.usable.non_finite} points are not finite and were dropped"
             frame.warnings.append(InputWarning("non-finite", text))
@@ -275,7 +275,7 @@ class Detector:
                 _log.warning("%s (said once)", warning.text)
         times_ms = dict.fromkeys(("input", *self.pipeline.stages, _WAITING), 0.0)
         last = frame.start
-        for name, end in frame.laps:
+        for name, end in frame.stage_times:
             times_ms[name] += (end - last) * 1e3
             last = end
         report = FrameReport(

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from asca_deploy.bundle import PillarBundle
 from asca_deploy.detector import Detector
-from asca_deploy.pillar.backbone import HeadAnswer
+from asca_deploy.pillar.backbone import HeadOutputs
 from asca_deploy.pillar.pipeline import Canvas, PillarPipeline
 from asca_deploy.two_stage.pipeline import RefinePipeline, refine_inputs
 from asca_pillars.base.errors import BundleError
@@ -27,7 +27,7 @@ from asca_pillars.detection.decode import HeadMaps, decode_candidates, sigmoid, 
 from asca_pillars.detection.detections import Detections
 from asca_pillars.ops.pillar.neck_rulebooks import rulebook_inputs
 from asca_pillars.ops.two_stage.decode import reported_detections
-from asca_pillars.ops.two_stage.first_stage import FirstPass, proposed_from
+from asca_pillars.ops.two_stage.first_stage import FirstStageOutputs, second_stage_inputs
 from asca_pillars.ops.two_stage.prepare import refine_scan
 from asca_pillars.scans.scan_reader import read_scan
 
@@ -73,7 +73,7 @@ def write_golden(out: Path, bundle: str | Path | None, scan: Path) -> Stages:
 def golden_stages(pipeline: PillarPipeline | RefinePipeline, points: NDArray[np.float32]) -> Stages:
     """Return the arrays of each stage, by stage and name, for finite points (N, 4), metres, reflectance within 0..1.
 
-    Stages, for M points in P pillars: `input`, `pillarize`, `encode`, `scatter` (or `tables` of a sparse neck),
+    Stages, for M points in P pillars: `input`, `pillarize`, `encode`, `scatter` (or `rulebooks` of a sparse neck),
     `neck+head`, `decode` (n boxes above their thresholds) and `suppress` (those that stay). With a second stage, after
     `neck+head`: `propose`, `neighbors`, `refine` and `suppress`. Maps are channels last, as the graph gives them.
     """
@@ -105,17 +105,17 @@ def golden_stages(pipeline: PillarPipeline | RefinePipeline, points: NDArray[np.
         "labels": candidates.labels,
     }
     found = suppress(candidates, spec.classes, spec.post)
-    return {**stages, "neck+head": _answered(answer), "decode": boxes, "suppress": _detections(found)}
+    return {**stages, "neck+head": _head_arrays(answer), "decode": boxes, "suppress": _detections(found)}
 
 
-def _second_stage(pipeline: RefinePipeline, first: FirstPass, points: NDArray[np.float32]) -> Stages:
-    proposed = proposed_from(first, points, pipeline.spec, pipeline.section.seen)
+def _second_stage(pipeline: RefinePipeline, first: FirstStageOutputs, points: NDArray[np.float32]) -> Stages:
+    proposed = second_stage_inputs(first, points, pipeline.spec, pipeline.section.seen)
     scan = refine_scan(points, proposed, proposed.proposals, pipeline.section.neighbors)
     inputs = refine_inputs(scan)
     confidence, residuals = pipeline.refine(inputs)
     found = reported_detections(proposed.proposals, confidence, residuals, pipeline.spec, pipeline.section.scores)
     return {
-        "neck+head": {**_answered(HeadAnswer(first.maps, first.cells)), "neck": first.neck},
+        "neck+head": {**_head_arrays(HeadOutputs(first.maps, first.cells)), "neck": first.neck},
         "propose": _detections(proposed.proposals),
         "neighbors": inputs,
         "refine": {"confidence": confidence, "residuals": residuals},
@@ -132,10 +132,10 @@ def _placed(placed: Any) -> dict[str, NDArray[Any]]:
     if isinstance(placed, Canvas):
         values = placed.image.reshape(-1, placed.image.shape[-1])[placed.occupied]
         return {"rows": placed.occupied.copy(), "values": values}
-    return {"pillar_features": placed.features, **rulebook_inputs(placed.tables)}
+    return {"pillar_features": placed.features, **rulebook_inputs(placed.rulebooks)}
 
 
-def _answered(answer: HeadAnswer) -> dict[str, NDArray[Any]]:
+def _head_arrays(answer: HeadOutputs) -> dict[str, NDArray[Any]]:
     if answer.cells is None:
         return {name: part.transpose(1, 2, 0) for name, part in zip(HeadMaps._fields, answer.maps, strict=True)}
     return {**dict(zip(HeadMaps._fields, answer.maps, strict=True)), "cells": answer.cells}

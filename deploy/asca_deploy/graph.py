@@ -68,14 +68,14 @@ def _compare(path: Path, kind: str, found: Mapping[str, Tensor], expected: Mappi
                 f"{path} has an unknown {kind} `{name}`, the runtime knows {', '.join(expected)}; "
                 "export the bundle again"
             )
-        want = expected[name]
-        fits = len(tensor.shape) == len(want.shape) and all(
+        expected_type = expected[name]
+        fits = len(tensor.shape) == len(expected_type.shape) and all(
             size is None or actual is None or actual == size
-            for actual, size in zip(tensor.shape, want.shape, strict=True)
+            for actual, size in zip(tensor.shape, expected_type.shape, strict=True)
         )
-        if not fits or tensor.type != want.type:
+        if not fits or tensor.type != expected_type.type:
             raise BundleError(
-                f"{path}: {kind} `{name}` is {_show(tensor)}, the bundle's spec needs {_show(want)};"
+                f"{path}: {kind} `{name}` is {_show(tensor)}, the bundle's spec needs {_show(expected_type)};"
                 " export the bundle again"
             )
 

@@ -9,11 +9,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from asca_deploy.around import ranges_around, turns_around, widened
+from asca_deploy.around import ranges_around, turns_around, widen_ranges
 from asca_deploy.detect_scans import repairs_of
 from asca_deploy.detector import usable_points
 from asca_deploy.manifest import load_bundle
-from asca_deploy.recordings.results import said_of_stamps
+from asca_deploy.recordings.results import timestamp_note
 from asca_deploy.shipped import find_bundle
 from asca_pillars.base.errors import ConfigError, ScanError
 from asca_pillars.base.extras import require
@@ -30,7 +30,7 @@ from asca_pillars.scans.mounting import Mounting
 from asca_pillars.scans.recordings.open_recording import is_recording, open_recording
 from asca_pillars.scans.recordings.recorded_scans import RecordedScan, RecordedScans
 from asca_pillars.scans.recordings.recording import Topic
-from asca_pillars.scans.scan_input import ScanInput, said_of_scale
+from asca_pillars.scans.scan_input import ScanInput, scale_notes
 from asca_pillars.scans.scan_reader import Scan, ScanNotes
 from asca_pillars.scans.scan_settings import ScanSettings, sample_points
 
@@ -132,7 +132,7 @@ def inspect_scans(
         AscaError: the bundle or an option cannot be used.
     """
     path, manifest = Path(path), load_bundle(find_bundle(bundle))
-    model = widened(manifest) if around else manifest
+    model = widen_ranges(manifest) if around else manifest
     ranges, expected = model.spec.ranges, model.expected_input
     if around:
         ranges = ranges_around(ranges, len(turns_around(ranges, camera_view=expected.camera_view)))
@@ -144,10 +144,10 @@ def inspect_scans(
     times: list[tuple[int, int]] = []
     frame_ids: dict[str, None] = {}
     fields: tuple[str, ...] = ()
-    troubles: list[str] = []
+    error_texts: list[str] = []
     for one in Reporter(progress).track(source.scans, "Inspecting", source.to_read):
         if one.scan is None:
-            troubles.append(str(one.trouble))
+            error_texts.append(str(one.error_text))
             continue
         times.append((one.number, one.time_ns))
         frame_ids[one.frame_id] = None
@@ -158,14 +158,14 @@ def inspect_scans(
     damage = recorded.recording.damage if recorded else None
     if not times:
         of_topic = f" of {recorded.topic.name}" if recorded else ""
-        why = f": {reason}" if (reason := next(iter(troubles), damage)) else ""
+        why = f": {reason}" if (reason := next(iter(error_texts), damage)) else ""
         raise ScanError(f"{path}: none of the {source.to_read} scans{of_topic} can be read{why}")
-    found = [*source.said, *([doubt] if doubt else []), *repairs_of(measured.notes)]
+    found = [*source.notes, *([doubt] if doubt else []), *repairs_of(measured.notes)]
     if recorded:
         found += _odd_times(times)
     if len(frame_ids) > 1:
         found.append(f"the scans are in {len(frame_ids)} frames: {', '.join(frame_ids)[:200]}")
-    problems = [f"{_count(len(troubles), 'scan')} cannot be read: {troubles[0]}"] if troubles else []
+    problems = [f"{_count(len(error_texts), 'scan')} cannot be read: {error_texts[0]}"] if error_texts else []
     return ScansInspection(
         path=str(path),
         model=model.name,
@@ -176,7 +176,7 @@ def inspect_scans(
         fields=fields,
         frame_ids=tuple(filter(None, frame_ids)),
         times=_scan_times(times) if recorded else None,
-        scans=len(times) + len(troubles) if recorded else source.total,
+        scans=len(times) + len(error_texts) if recorded else source.total,
         inspected=len(measured.points),
         points=spread(np.array(measured.points)),
         not_finite=sum(notes.dropped_points for _, notes, _ in measured.notes),
@@ -197,7 +197,7 @@ class _Source(NamedTuple):
     """Scans to inspect.
 
     Of a recording all scans are read, and those measured whose number `step` divides; of `total` files every `step`-th
-    is read. `said` are sentences about how.
+    is read. `notes` are sentences about how.
     """
 
     scans: Iterator[RecordedScan]
@@ -205,7 +205,7 @@ class _Source(NamedTuple):
     to_read: int
     step: int
     samples: Iterable[NamedPoints]
-    said: Sequence[str]
+    notes: Sequence[str]
     name: Callable[[int], str]
     recorded: RecordedScans | None = None
 
@@ -216,9 +216,9 @@ def _open_recording(path: Path, topic: str | None, reading: ScanSettings, frames
     require("recordings")
     recording = open_recording(path)
     scans = RecordedScans(recording, recording.point_cloud_topic(topic), reading.reflectance_scale)
-    total, said = scans.topic.messages, said_of_scale(scans.scale)
+    total, notes = scans.topic.messages, scale_notes(scans.scale)
     step = max(math.ceil(total / frames), 1)
-    return _Source(scans.read(), total, total, step, scans.samples(), said, "scan {}".format, scans)
+    return _Source(scans.read(), total, total, step, scans.samples(), notes, "scan {}".format, scans)
 
 
 def _open_files(path: Path, reading: ScanSettings, frames: int) -> _Source:
@@ -232,7 +232,7 @@ def _open_files(path: Path, reading: ScanSettings, frames: int) -> _Source:
         to_read=len(chosen),
         step=step,
         samples=sample_points(paths, lambda one: files.read(one).points),
-        said=files.said,
+        notes=files.notes,
         name=lambda number: paths[number].name,
     )
 
@@ -309,14 +309,14 @@ def _scan_times(times: Sequence[tuple[int, int]]) -> ScanTimes:
 
 def _odd_times(times: Sequence[tuple[int, int]]) -> list[str]:
     """Sentences about stamps that go back or jump, and about gaps."""
-    said = [said] if (said := said_of_stamps([stamp for _, stamp in times])) else []
+    notes = [notes] if (notes := timestamp_note([stamp for _, stamp in times])) else []
     found = _scan_times(times)
     if found.gaps:
-        said.append(
+        notes.append(
             f"{_count(found.gaps, 'gap')} in the time stamps, the longest of {found.longest_gap_s:.3g} s after scan "
             f"{found.longest_gap_after}: at the usual rate {_count(found.missing, 'scan')} more would be there"
         )
-    return said
+    return notes
 
 
 def _count(number: int, what: str) -> str:

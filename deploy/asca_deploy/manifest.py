@@ -20,7 +20,7 @@ from asca_deploy.bundle import (
     PvRcnnBundle,
 )
 from asca_deploy.layout import difference, layout_of
-from asca_deploy.manifest_file import EXPORT_AGAIN, LONGEST_REASON, first_misread, read_manifest
+from asca_deploy.manifest_file import EXPORT_AGAIN, LONGEST_REASON, first_parsing_difference, read_manifest
 from asca_deploy.onnx_file import has_external_data, read_metadata
 from asca_pillars.base.errors import AscaError, BundleError, printable
 from asca_pillars.base.files import write_json
@@ -76,14 +76,14 @@ def load_bundle(folder: str | Path) -> Bundle:
         data = upgrade_schema_2(data)
     data |= {name: first | data[name] for name, first in _LATER_KEYS.items() if isinstance(data.get(name), dict)}
     family: type[Bundle] = PvRcnnBundle if data.get("kind") == "pv_rcnn" else PillarBundle
-    layout = _take_out_layout(manifest, data) if family is PillarBundle else None
+    layout = _pop_layout(manifest, data) if family is PillarBundle else None
     try:
         bundle = parse(family, data, str(manifest))
-        if ignored := first_misread(data, to_dict(bundle)):
+        if ignored := first_parsing_difference(data, to_dict(bundle)):
             raise BundleError(f"`{ignored}` is missing or of the wrong type")
     except AscaError as error:
         # The grid and the classes check themselves and do not know the file they were read from.
-        raise BundleError(f"{_blamed(manifest, error)}; {EXPORT_AGAIN}") from None
+        raise BundleError(f"{_bundle_error_text(manifest, error)}; {EXPORT_AGAIN}") from None
     except (ArithmeticError, ValueError, RecursionError, MemoryError) as error:
         raise BundleError(
             f"{manifest}: a value makes no sense ({printable(str(error), LONGEST_REASON)}); {EXPORT_AGAIN}"
@@ -104,7 +104,7 @@ def load_bundle(folder: str | Path) -> Bundle:
     return bundle
 
 
-def _take_out_layout(manifest: Path, data: dict[str, Any]) -> Any:
+def _pop_layout(manifest: Path, data: dict[str, Any]) -> Any:
     """Remove and return the layout of a pillar detector's manifest; later keys of `spec` get their first meaning."""
     if data.get("kind") == "pillar" and "refine" in data:
         raise BundleError(f"{manifest}: `refine` belongs to kind pillar_refine, this is pillar; {EXPORT_AGAIN}")
@@ -138,8 +138,8 @@ def upgrade_schema_2(data: dict[str, Any]) -> dict[str, Any]:
 
 
 def write_bundle_manifest(folder: str | Path, bundle: Bundle) -> None:
-    """Write bundle.json beside the graphs in `folder`, which must lie there already, stamped with `essentials`."""
-    stamped = essentials(bundle)
+    """Write bundle.json beside the graphs in `folder`, which must lie there already, stamped with `graph_metadata`."""
+    stamped = graph_metadata(bundle)
     for graph in bundle.graphs.values():
         _verify_graph(Path(folder), graph, stamped)
     write_json(Path(folder) / MANIFEST, bundle_to_json(bundle))
@@ -155,7 +155,7 @@ def bundle_to_json(bundle: Bundle) -> dict[str, Any]:
     return data
 
 
-def essentials(bundle: Bundle) -> dict[str, Any]:
+def graph_metadata(bundle: Bundle) -> dict[str, Any]:
     """Return the fields that the export stamps into the metadata of each graph, see ESSENTIALS."""
     data = bundle_to_json(bundle)
     return {key: data[key] for key in _stamped_keys(data)}
@@ -180,7 +180,7 @@ def _verify_refine(manifest: Path, bundle: PillarBundle) -> None:
         raise BundleError(f"{manifest}: `refine.seen.proposals.quotas` has not one for each class; {EXPORT_AGAIN}")
 
 
-def _blamed(manifest: Path, error: AscaError) -> str:
+def _bundle_error_text(manifest: Path, error: AscaError) -> str:
     reason = str(error).removeprefix(f"{manifest}: ")
     return f"{manifest}: {printable(reason, LONGEST_REASON)}"
 

@@ -38,8 +38,8 @@ def read_manifest(manifest: Path) -> dict[str, Any]:
         raise BundleError(f"{manifest} is damaged ({printable(str(error), LONGEST_REASON)}); {EXPORT_AGAIN}") from None
     version = data.get("schema_version") if isinstance(data, dict) else None
     if type(version) is not int:
-        shown = reprlib.repr(version)
-        raise BundleError(f"{manifest} is not a bundle's manifest: `schema_version` is {shown}; {EXPORT_AGAIN}")
+        version_text = reprlib.repr(version)
+        raise BundleError(f"{manifest} is not a bundle's manifest: `schema_version` is {version_text}; {EXPORT_AGAIN}")
     if version > SCHEMA_VERSION:
         raise BundleError(
             f"{manifest}: schema_version {reprlib.repr(version)} is newer than {SCHEMA_VERSION}, which this version "
@@ -50,7 +50,7 @@ def read_manifest(manifest: Path) -> dict[str, Any]:
     return dict(data)
 
 
-def first_misread(written: Any, understood: Any) -> str | None:
+def first_parsing_difference(written: Any, understood: Any) -> str | None:
     """Return the path of the first value that was not taken as it is written, such as true for 1 or a default; or None.
 
     A key that is understood as None need not be written: bundles made before there was such a key lack it.
@@ -63,14 +63,14 @@ def first_misread(written: Any, understood: Any) -> str | None:
                 continue
             if key not in written:
                 return str(key)
-            if inner := first_misread(written[key], value):
+            if inner := first_parsing_difference(written[key], value):
                 return key if inner == "*" else f"{key}.{inner}"
         return None
     if isinstance(understood, list):
         if not isinstance(written, list) or len(written) != len(understood):
             return "*"
         for index, (ours, theirs) in enumerate(zip(written, understood, strict=True)):
-            if inner := first_misread(ours, theirs):
+            if inner := first_parsing_difference(ours, theirs):
                 return str(index) if inner == "*" else f"{index}.{inner}"
         return None
     if isinstance(understood, float) and type(written) is int:

@@ -100,11 +100,11 @@ def _open_bundle(options: RuntimeOptions, min_score: float, mounting: Mounting, 
     logging.getLogger("asca_pillars").setLevel(logging.ERROR)  # its warnings are collected below
     detector = open_detector(options, min_score, mounting, around=around)
     bundle = detector.bundle
-    unlike: list[str] = []
+    input_warnings: list[str] = []
 
     def detect(points: NDArray[np.float32]) -> Detections:
         detections = detector(points)
-        unlike.extend(detections.report.warnings[:1])
+        input_warnings.extend(detections.report.warnings[:1])
         return detections
 
     about = {
@@ -119,7 +119,7 @@ def _open_bundle(options: RuntimeOptions, min_score: float, mounting: Mounting, 
         "min_score": min_score,
     }
     camera_view = bundle.expected_input.camera_view and not around
-    return Model(bundle.name, detect, bundle.spec, camera_view, about, unlike)
+    return Model(bundle.name, detect, bundle.spec, camera_view, about, input_warnings)
 
 
 def _open_checkpoint(path: Path, options: RuntimeOptions, min_score: float, mounting: Mounting) -> Model:

@@ -6,7 +6,7 @@ from typing import Any, Literal
 from asca_deploy import auto, providers
 from asca_deploy.bundle import Bundle, PillarBundle, PvRcnnBundle
 from asca_deploy.pillar.pipeline import PillarPipeline
-from asca_deploy.pipeline import Laps, Pipeline
+from asca_deploy.pipeline import Pipeline, StageTimes
 from asca_deploy.pv_rcnn.pipeline import PvRcnnPipeline
 from asca_deploy.shipped import sample_scan_path
 from asca_deploy.two_stage.pipeline import RefinePipeline
@@ -47,7 +47,7 @@ def open_pipeline(
     points = read_scan(sample_scan_path()).points
 
     def detect(pipeline: Pipeline[Any, Any]) -> Detections:
-        laps: Laps = []
-        return pipeline.finish(pipeline.infer(pipeline.prepare(points, laps), laps), laps)
+        stage_times: StageTimes = []
+        return pipeline.finish(pipeline.infer(pipeline.prepare(points, stage_times), stage_times), stage_times)
 
     return auto.choose(providers.available(), open_on, detect, bundle.spec, precision, weights=bundle.precision)

@@ -76,7 +76,9 @@ _OF_A_SCAN: dict[str, Recognizer] = {
 """Files of a single scan, by the endings of their names."""
 
 
-def claim(out: Path, markers: Mapping[str, Recognizer] | None = None, written: Collection[str] = ()) -> None:
+def require_own_results(
+    out: Path, markers: Mapping[str, Recognizer] | None = None, written: Collection[str] = ()
+) -> None:
     """Make sure that `asca detect` may write into `out`: it is absent, empty, or that of an earlier run.
 
     Args:
@@ -128,7 +130,7 @@ class ResultWriter:
 
     def __enter__(self) -> "ResultWriter":
         self._written = {f"{name.as_posix()}{ending}" for name in self._names for ending in _OF_A_SCAN}
-        claim(self.out, written=self._written)
+        require_own_results(self.out, written=self._written)
         for folder in {name.parent for name in self._names}:
             require_no_link(self.out, folder)
             recover(self.out / folder)

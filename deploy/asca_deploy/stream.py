@@ -21,7 +21,7 @@ Maps = TypeVar("Maps")
 Result = TypeVar("Result")
 
 
-def overlapped(
+def overlap_stages(
     scans: Iterable[Scan],
     prepare: Callable[[Scan], Ready],
     infer: Callable[[Ready], Maps],
@@ -44,7 +44,7 @@ def overlapped(
     Raises:
         Exception: whatever `scans` or a stage raises, in the place of the scan it belongs to; it ends the iterator.
     """
-    with _Ahead(scans, prepare, infer) as ahead:
+    with _StageThreads(scans, prepare, infer) as ahead:
         coming = ahead.start()
         while True:
             current, coming = coming, ahead.start()
@@ -54,7 +54,7 @@ def overlapped(
             yield finish(found[0])
 
 
-class _Ahead(Generic[Scan, Ready, Maps]):
+class _StageThreads(Generic[Scan, Ready, Maps]):
     """Two daemon threads, one for `prepare` and one for `infer`.
 
     Daemons, because the interpreter joins other threads before `atexit` functions run, and a source that blocks could
@@ -71,7 +71,7 @@ class _Ahead(Generic[Scan, Ready, Maps]):
         self._host = threading.Thread(target=self._run_host, name="asca-host", daemon=True)
         self._network = threading.Thread(target=self._run_network, name="asca-network", daemon=True)
 
-    def __enter__(self) -> "_Ahead[Scan, Ready, Maps]":
+    def __enter__(self) -> "_StageThreads[Scan, Ready, Maps]":
         self._host.start()
         self._network.start()
         _open.add(self)
@@ -141,7 +141,7 @@ class _Ahead(Generic[Scan, Ready, Maps]):
             del item, future, ready
 
 
-_open: set[_Ahead[Any, Any, Any]] = set()
+_open: set[_StageThreads[Any, Any, Any]] = set()
 
 
 @atexit.register

@@ -157,10 +157,10 @@ class Tracker:
         state.unseen_s = state.unseen_s + elapsed_s
         state = state.chosen((state.scores >= self._death_score) & (seen | (state.unseen_s <= self._max_unseen_s)))
         state.boxes[:, :2] += elapsed_s * state.velocities
-        place, both, speed = state.covariance.T
+        place, cross, speed = state.covariance.T
         noise = ACCELERATION_MPS2**2 * np.array([elapsed_s**4 / 4, elapsed_s**3 / 2, elapsed_s**2])
-        place = place + 2 * elapsed_s * both + elapsed_s**2 * speed
-        state.covariance = np.stack([place, both + elapsed_s * speed, speed], axis=1) + noise
+        place = place + 2 * elapsed_s * cross + elapsed_s**2 * speed
+        state.covariance = np.stack([place, cross + elapsed_s * speed, speed], axis=1) + noise
         self._state = state
 
     def _match(self, boxes: _Doubles, labels: _Integers) -> _Integers:
@@ -185,16 +185,16 @@ class Tracker:
     def _update(self, rows: _Integers, boxes: _Doubles, scores: _Doubles) -> None:
         """Correct tracks by their matched detections (N, 7)."""
         state = self._state
-        place, both, speed = state.covariance[rows].T
+        place, cross, speed = state.covariance[rows].T
         gain_place = place / (place + MEASURED_SIGMA_M**2)
-        gain_speed = both / (place + MEASURED_SIGMA_M**2)
+        gain_speed = cross / (place + MEASURED_SIGMA_M**2)
         off = boxes[:, :2] - state.boxes[rows, :2]
         centers = state.boxes[rows, :2] + gain_place[:, None] * off
         state.velocities[rows] += gain_speed[:, None] * off
         state.boxes[rows] = boxes
         state.boxes[rows, :2] = centers
         kept = 1.0 - gain_place
-        state.covariance[rows] = np.stack([kept * place, kept * both, speed - gain_speed * both], axis=1)
+        state.covariance[rows] = np.stack([kept * place, kept * cross, speed - gain_speed * cross], axis=1)
         state.scores[rows] = np.minimum(1.0 - (1.0 - state.scores[rows]) * (1.0 - scores), MAX_SCORE)
         state.unseen_s[rows] = 0.0
 

@@ -71,7 +71,7 @@ class ScanServer:
     Attributes:
         address: where the page is.
         names: of the scans, in the order in which the page shows them.
-        said: sentences about what was decided for the scans.
+        notes: sentences about what was decided for the scans.
 
     Raises:
         ScanError: there are no scans, or the first cannot be read.
@@ -96,12 +96,14 @@ class ScanServer:
         paths = [scan.path for scan in named]
         scan_input = ScanInput(reading, paths)
         detector = open_detector(options, score, scan_input.mounting, around=around)
-        shown = {one.name: one.score_threshold for one in detector.spec.classes}
-        lowest = {name: min(value, LOWEST_SCORE) if detector.passes == 1 else value for name, value in shown.items()}
+        thresholds = {one.name: one.score_threshold for one in detector.spec.classes}
+        lowest = {
+            name: min(value, LOWEST_SCORE) if detector.passes == 1 else value for name, value in thresholds.items()
+        }
         detector.spec = detector.pipeline.spec = detector.spec.with_score_threshold(lowest)
         self.names = [scan.name.as_posix() + scan.path.suffix for scan in named]
-        self.said = tuple(scan_input.said)
-        answers = _Answers(paths, scan_input, detector, around=around)
+        self.notes = tuple(scan_input.notes)
+        answers = _ScanContents(paths, scan_input, detector, around=around)
         answers.boxes(0)  # errors that concern all scans are raised before the page opens
         files = {f"/{file.name}": file.read_bytes() for file in page_modules()}
         files["/"] = files["/index.html"]
@@ -109,7 +111,7 @@ class ScanServer:
             "bundle": detector.bundle.name,
             "runs_on": detector.runs_on,
             "scans": self.names,
-            "classes": [{"name": name, "score": value, "lowest": lowest[name]} for name, value in shown.items()],
+            "classes": [{"name": name, "score": value, "lowest": lowest[name]} for name, value in thresholds.items()],
             "limit": detector.spec.post.max_detections,
             "colors": color_table(detector.spec.class_names),
             "heights": height_table(),
@@ -152,7 +154,7 @@ class _Server(ThreadingHTTPServer):
     daemon_threads = True  # a browser's open connection does not hold up the end
 
 
-class _Answers:
+class _ScanContents:
     """Points and boxes of scans by their number; requests are handled one at a time."""
 
     def __init__(self, paths: Sequence[Path], scan_input: ScanInput, detector: Detector, *, around: bool) -> None:

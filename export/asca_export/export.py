@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_deploy.bundle import Bundle
+from asca_export.bundle_writer import DEFAULTS, ExportOptions
 from asca_export.pillar.export import export_pillar_bundle, require_maskable
-from asca_export.proven_bundle import DEFAULTS, ExportOptions
 from asca_export.pv_rcnn.export import export_pv_rcnn_bundle
 from asca_export.two_stage.export import export_refine_bundle
 from asca_pillars.models.checkpoint import Checkpoint

@@ -82,9 +82,9 @@ def export(
         AscaError: an argument cannot be used, `out` holds something else, or the graphs differ from PyTorch.
     """
     require("train")
+    from asca_export.bundle_writer import ExportOptions
     from asca_export.export import export_bundle
     from asca_export.pillar.export import require_maskable
-    from asca_export.proven_bundle import ExportOptions
 
     checkpoint, out, reporter = Path(checkpoint), Path(out), Reporter(progress)
     require_replaceable(out, *BUNDLE_FOLDER)  # before minutes of work

@@ -109,7 +109,7 @@ class FastBackbone(nn.Module):
         if padded:
             first.padding = (0, 0)
         if steps is not None:
-            _take_steps(first, steps, padded=padded)
+            _fold_scale(first, steps, padded=padded)
 
     def stages(self) -> list[Stage]:
         """Return the blocks, from the finest map to the coarsest."""
@@ -187,7 +187,7 @@ def _folded(block: nn.Module) -> nn.Sequential:
     return nn.Sequential(*layers)
 
 
-def _take_steps(first: nn.Conv2d, steps: CanvasSteps, *, padded: bool) -> None:
+def _fold_scale(first: nn.Conv2d, steps: CanvasSteps, *, padded: bool) -> None:
     """Let the first convolution read steps."""
     assert first.bias is not None
     assert padded or not steps.empty.any(), "a convolution pads with zeros"

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 from asca_deploy.bundle import Bundle
 from asca_deploy.graph import Tensor as Declared
-from asca_deploy.manifest import essentials, graph_files
+from asca_deploy.manifest import graph_files, graph_metadata
 from asca_deploy.pillar.graphs import PILLAR_FEATURES
 from asca_export.fast_forms import FastBackbone
 from asca_export.pillar.masked_forms import MaskedBackbone
@@ -128,7 +128,7 @@ def graph_path(folder: Path, name: str) -> Path:
 
 def sign(folder: Path, bundle: B) -> B:
     """Stamp the graphs in `folder` with what they must not be separated from; the bundle with their SHA-256."""
-    properties = {key: json.dumps(value) for key, value in essentials(bundle).items()}
+    properties = {key: json.dumps(value) for key, value in graph_metadata(bundle).items()}
     for name in bundle.graph_names:
         path = graph_path(folder, name)
         model = onnx.load(path)

@@ -17,7 +17,7 @@ from asca_deploy.pillar.pipeline import PillarPipeline, open_backbone
 from asca_export import graphs
 from asca_export.parity import COMPARED_ANCHORS, by_class
 from asca_export.quantize import canvas_steps
-from asca_export.rounded_backbones import Encoded, quantize_encoder, round_backbone
+from asca_export.rounded_backbones import EncodedScan, quantize_encoder, round_backbone
 from asca_pillars.base.errors import ExportError
 from asca_pillars.detection.detections import Detections
 from asca_pillars.geometry.overlap import bev_iou
@@ -76,8 +76,8 @@ def calibration_scans(
     Raises:
         ExportError: fewer than MIN_CALIBRATION.
     """
-    shown = {_digest(points) for points in scans}
-    own = [points for points in calibration if _digest(points) not in shown]
+    digests = {_digest(points) for points in scans}
+    own = [points for points in calibration if _digest(points) not in digests]
     dropped = len(calibration) - len(own)
     used = [points for points in own if (spec.grid.cells(points) >= 0).any()]
     if len(used) < MIN_CALIBRATION:
@@ -128,7 +128,7 @@ def quantize_bundle(
         def error_of(eight_bit: Sequence[str]) -> float:
             rounded.write(trial, eight_bit)
             backbone = open_backbone(trial, eight_bit_form, "cpu", "float32", runtime.threads)
-            placed = (backbone.place(each.in_steps(steps), each.pillars.cells) for each in compared)
+            placed = (backbone.place(each.quantize_features(steps), each.pillars.cells) for each in compared)
             found = (backbone.run(each).maps.scores for each in placed)
             return logit_error(expected, found, bundle.spec)
 
@@ -193,8 +193,8 @@ def sweep(
 
 def _with_boxes(report: Quantization, expected: Sequence[Detections], found: Sequence[Detections]) -> Quantization:
     """Return the report with the boxes that the 8-bit bundle finds again, and those that it alone finds."""
-    matched = sum(map(_partnered, expected, found))
-    added = sum(map(len, found)) - sum(map(_partnered, found, expected))
+    matched = sum(map(_count_matches, expected, found))
+    added = sum(map(len, found)) - sum(map(_count_matches, found, expected))
     return replace(report, boxes_matched=matched, boxes_added=added)
 
 
@@ -202,9 +202,9 @@ def _digest(points: Points) -> bytes:
     return hashlib.sha256(points.tobytes()).digest()
 
 
-def _encode(pipeline: PillarPipeline, points: Points) -> Encoded:
+def _encode(pipeline: PillarPipeline, points: Points) -> EncodedScan:
     pillars = pipeline.pillarize(points)
-    return Encoded(pipeline.encode(pillars), pillars)
+    return EncodedScan(pipeline.encode(pillars), pillars)
 
 
 def logit_error(
@@ -212,15 +212,15 @@ def logit_error(
 ) -> float:
     """Return the RMS difference of the class logits, at the COMPARED_ANCHORS best anchors of each class and scan."""
     squares = []
-    for want, got in zip(expected, found, strict=True):
-        for ours, theirs in zip(by_class(want, spec), by_class(got, spec), strict=True):
+    for reference, got in zip(expected, found, strict=True):
+        for ours, theirs in zip(by_class(reference, spec), by_class(got, spec), strict=True):
             if len(ours):
                 best = np.argpartition(-ours, min(COMPARED_ANCHORS, ours.size - 1))[:COMPARED_ANCHORS]
                 squares.append(np.square(ours[best] - theirs[best]).mean())
     return float(np.sqrt(np.mean(squares)))
 
 
-def _partnered(boxes: Detections, others: Detections) -> int:
+def _count_matches(boxes: Detections, others: Detections) -> int:
     """Return the number of boxes that match one of the others."""
     same = boxes.labels[:, None] == others.labels[None]
     return int(((bev_iou(boxes.boxes, others.boxes) >= SAME_IOU) & same).any(axis=1).sum())

@@ -24,7 +24,7 @@ from asca_pillars.ops.pillar.spec import PillarSpec
 from asca_pillars.ops.pv_rcnn.spec import VoxelSpec
 from asca_pillars.ops.two_stage.decode import Scores, reported_detections
 
-MAP_TOLERANCE = 1e-3  # largest absolute difference of a head map; of pillar features, see `prove_parity`
+MAP_TOLERANCE = 1e-3  # largest absolute difference of a head map; of pillar features, see `check_parity`
 BOX_TOLERANCE_M = 0.01
 YAW_TOLERANCE_RAD = np.deg2rad(0.5)
 OVERLAP_TIE = 1e-4  # tolerance of an overlap at the NMS threshold
@@ -38,7 +38,7 @@ class LargestDifferences(NamedTuple):
     yaw_rad: float
 
 
-def prove_parity(detector: PillarDetector, runtime: PillarPipeline, scans: Sequence[NDArray[np.float32]]) -> Parity:
+def check_parity(detector: PillarDetector, runtime: PillarPipeline, scans: Sequence[NDArray[np.float32]]) -> Parity:
     """Compare the PyTorch detector with the exported one.
 
     Args:
@@ -114,14 +114,14 @@ def require_close(
     """Return the largest difference; ExportError if it exceeds `allowed`."""
     error = float(np.abs(expected - found).max(initial=0.0))
     if not error <= allowed:
-        raise _unlike(
+        raise _parity_error(
             scan,
             f"PyTorch and onnxruntime part at stage {stage}: largest difference {error:.3g}, allowed {allowed:.3g}",
         )
     return error
 
 
-def _unlike(scan: int, difference: str) -> ExportError:
+def _parity_error(scan: int, difference: str) -> ExportError:
     return ExportError(
         f"scan {scan}: {difference}; nothing is written: try other versions of onnxruntime or torch, and if they say "
         "the same, report it with the scan, the number of which counts from 0"
@@ -151,9 +151,9 @@ def require_same_refined(
     spec = spec.with_score_threshold(0.0)
     spec = replace(spec, post=replace(spec.post, nms_iou=1.0, max_detections=max(len(proposals), 1)))
     boxes, partners = (reported_detections(proposals, *answer, spec, scores) for answer in (expected, found))
-    difference, lone = nearest_partners(boxes, partners)
+    difference, lone = match_nearest(boxes, partners)
     if len(lone):
-        raise _unlike(
+        raise _parity_error(
             scan,
             f"{len(lone)} refined boxes have no partner within {BOX_TOLERANCE_M} m and "
             f"{np.rad2deg(YAW_TOLERANCE_RAD)} degrees",
@@ -187,9 +187,9 @@ def compare_boxes(
     for post in (replace(uncut, nms_iou=1.0), uncut):
         lowered = replace(spec, classes=classes, post=post)
         ours, theirs = lowered.decode(expected, cells), lowered.decode(found, cells)
-        forward, our_lone = nearest_partners(ours, theirs)
-        backward, their_lone = nearest_partners(theirs, ours)
-        _require_ties(ours[our_lone], theirs[their_lone], ours, theirs, lowered, scan)
+        forward, our_lone = match_nearest(ours, theirs)
+        backward, their_lone = match_nearest(theirs, ours)
+        _require_score_ties(ours[our_lone], theirs[their_lone], ours, theirs, lowered, scan)
         worst = LargestDifferences(*map(max, zip(worst, forward, backward, strict=True)))
     return worst
 
@@ -202,7 +202,7 @@ def _score_of_rank(logits: NDArray[np.float32]) -> float:
     return float(1 / (1 + np.exp(-logit.astype(np.float64))))
 
 
-def nearest_partners(boxes: Detections, partners: Detections) -> tuple[LargestDifferences, NDArray[np.int64]]:
+def match_nearest(boxes: Detections, partners: Detections) -> tuple[LargestDifferences, NDArray[np.int64]]:
     """Largest difference between boxes and their nearest partners, and the boxes (n,) without one in tolerance."""
     worst_m = worst_rad = 0.0
     lone = []
@@ -219,7 +219,7 @@ def nearest_partners(boxes: Detections, partners: Detections) -> tuple[LargestDi
     return LargestDifferences(worst_m, worst_rad), np.array(lone, dtype=np.int64)
 
 
-def _require_ties(
+def _require_score_ties(
     our_lone: Detections, their_lone: Detections, ours: Detections, theirs: Detections, spec: PillarSpec, scan: int
 ) -> None:
     """Raise ExportError unless ties between scores explain every box that one side alone has.
@@ -228,8 +228,8 @@ def _require_ties(
     overlap with one is as large as suppression allows, within rounding; and if it overlaps an explained box of the
     other side, which suppression then put in its place or took out of its way.
     """
-    explained = [_ties(our_lone, theirs, spec), _ties(their_lone, ours, spec)]
-    clash = _beyond_allowed(our_lone, their_lone, spec) > 0
+    explained = [_are_score_ties(our_lone, theirs, spec), _are_score_ties(their_lone, ours, spec)]
+    clash = _excess_overlap(our_lone, their_lone, spec) > 0
     while True:
         grown = [explained[0] | clash[:, explained[1]].any(axis=1), explained[1] | clash[explained[0]].any(axis=0)]
         if all(np.array_equal(before, after) for before, after in zip(explained, grown, strict=True)):
@@ -237,23 +237,23 @@ def _require_ties(
         explained = grown
     for lone, known in zip((our_lone, their_lone), explained, strict=True):
         for name, box, score in zip(lone[~known].names, lone[~known].boxes, lone[~known].scores, strict=True):
-            raise _unlike(
+            raise _parity_error(
                 scan,
                 f"the {name} at x = {box[0]:.2f}, y = {box[1]:.2f} m with score {score:.3f} "
                 f"has no partner within {BOX_TOLERANCE_M} m and {np.rad2deg(YAW_TOLERANCE_RAD)} degrees",
             )
 
 
-def _ties(lone: Detections, others: Detections, spec: PillarSpec) -> NDArray[np.bool_]:
+def _are_score_ties(lone: Detections, others: Detections, spec: PillarSpec) -> NDArray[np.bool_]:
     thresholds = np.array([class_.score_threshold for class_ in spec.classes])
     tied = np.abs(thresholds[lone.labels] - lone.scores) <= MAP_TOLERANCE
     equal = np.abs(lone.scores[:, None] - others.scores[None]) <= MAP_TOLERANCE
-    beyond = _beyond_allowed(lone, others, spec)
+    beyond = _excess_overlap(lone, others, spec)
     barely = (np.abs(beyond) <= OVERLAP_TIE) & (spec.post.nms_iou < 1)  # 1: nothing was suppressed
     return tied | ((beyond > 0) & equal | barely).any(axis=1)
 
 
-def _beyond_allowed(a: Detections, b: Detections, spec: PillarSpec) -> NDArray[np.float64]:
+def _excess_overlap(a: Detections, b: Detections, spec: PillarSpec) -> NDArray[np.float64]:
     """Return (N, M): overlap minus the largest that suppression allows; -inf for pairs of two classes."""
     same_class = a.labels[:, None] == b.labels[None]
     return np.where(same_class, bev_iou(a.boxes, b.boxes) - spec.post.nms_iou, -np.inf)

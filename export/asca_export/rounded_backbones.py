@@ -34,14 +34,14 @@ from asca_pillars.ops.pillar.grid import pool_pillars
 from asca_pillars.ops.pillar.prepare import Pillars
 
 
-class Encoded(NamedTuple):
+class EncodedScan(NamedTuple):
     """A scan on its way to the backbone."""
 
     features: NDArray[np.float32]
     """(P, C)"""
     pillars: Pillars
 
-    def in_steps(self, steps: CanvasSteps) -> NDArray[np.uint8]:
+    def quantize_features(self, steps: CanvasSteps) -> NDArray[np.uint8]:
         """Return the features in whole steps, (P, C), unitless."""
         scale, empty = steps.scale.numpy(), steps.empty.numpy()
         return np.clip(np.round(self.features / scale + empty), 0, STEPS).astype(np.uint8)
@@ -59,7 +59,7 @@ class RoundedBackbone(Protocol):
 
 
 def round_backbone(
-    detector: PillarDetector, encoded: Sequence[Encoded], steps: CanvasSteps, work: Path
+    detector: PillarDetector, encoded: Sequence[EncodedScan], steps: CanvasSteps, work: Path
 ) -> RoundedBackbone:
     """Round the weights of a dense or of a sparse neck and its head.
 
@@ -75,7 +75,7 @@ def round_backbone(
         def canvases() -> Iterator[NDArray[np.uint8]]:
             canvas = Canvas(channels, detector.grid, form)
             return (
-                canvas.scatter(*pool_pillars(each.in_steps(steps), each.pillars.cells, detector.grid))
+                canvas.scatter(*pool_pillars(each.quantize_features(steps), each.pillars.cells, detector.grid))
                 for each in encoded
             )
 
@@ -125,8 +125,8 @@ class RoundedMaps:
 
 
 class _RoundedSparse:
-    def __init__(self, detector: PillarDetector, encoded: Sequence[Encoded], steps: CanvasSteps) -> None:
-        samples = [_sample(detector, each).in_steps(steps) for each in encoded]
+    def __init__(self, detector: PillarDetector, encoded: Sequence[EncodedScan], steps: CanvasSteps) -> None:
+        samples = [_sample(detector, each).quantize_features(steps) for each in encoded]
         self._exact = SparseBackbone(detector, steps)
         scale_rows_to_steps(self._exact, samples)
         self._rounded, self.layers = copy.deepcopy(self._exact), list(self._exact.products)
@@ -137,11 +137,11 @@ class _RoundedSparse:
         export_sparse_backbone(mixed, path, eight_bit, steps=True)
 
 
-def _sample(detector: PillarDetector, encoded: Encoded) -> SparseSample:
-    tables = detector.preparation.place(encoded.pillars).tables
-    assert tables is not None
+def _sample(detector: PillarDetector, encoded: EncodedScan) -> SparseSample:
+    rulebooks = detector.preparation.place(encoded.pillars).rulebooks
+    assert rulebooks is not None
     features, _ = pool_pillars(encoded.features, encoded.pillars.cells, detector.grid)
-    return SparseSample(torch.from_numpy(features), tree_map_only(np.ndarray, torch.from_numpy, tables))
+    return SparseSample(torch.from_numpy(features), tree_map_only(np.ndarray, torch.from_numpy, rulebooks))
 
 
 OP_TYPES = ["Conv", "MatMul", "Relu", "Transpose", "Reshape", "Concat"]

@@ -36,18 +36,18 @@ class RowGraph:
         self._inputs: dict[str, onnx.ValueInfoProto] = {}
         self._outputs: list[onnx.ValueInfoProto] = []
 
-    def take(self, name: str, kind: int, rows: str, width: int | None = None) -> str:
+    def add_input(self, name: str, kind: int, rows: str, width: int | None = None) -> str:
         """Declare an input (rows, width), or (rows,)."""
         self._inputs[name] = helper.make_tensor_value_info(name, kind, [rows] if width is None else [rows, width])
         return name
 
-    def give(self, name: str, kind: int, rows: str, width: int) -> None:
+    def add_output(self, name: str, kind: int, rows: str, width: int) -> None:
         """Declare a node's result (rows, width) an output."""
         self._outputs.append(helper.make_tensor_value_info(name, kind, [rows, width]))
 
     def gather(self, owner: str, rows: str, missing: NDArray[Any], table: str, taps: int) -> str:
         """Gather unitless rows by the table (M, taps), the row `missing` (C,) behind the last: (M, taps * C)."""
-        self.take(table, TensorProto.INT32, f"{table}_rows", taps)
+        self.add_input(table, TensorProto.INT32, f"{table}_rows", taps)
         padded = self.node("Concat", owner, "padded", rows, self.constant(owner, "missing", missing[None]), axis=0)
         gathered = self.node("Gather", owner, "gathered", padded, table, axis=0)
         return self.reshape(owner, "rows", gathered, taps * len(missing))

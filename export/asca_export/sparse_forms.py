@@ -95,9 +95,9 @@ class SparseBackbone(nn.Module):
         assert isinstance(product, nn.Linear)
         return product
 
-    def passes(self, features: Tensor, tables: NeckRulebooks[Tensor]) -> Iterator[tuple[str, Tensor, Tensor]]:
+    def passes(self, features: Tensor, rulebooks: NeckRulebooks[Tensor]) -> Iterator[tuple[str, Tensor, Tensor]]:
         """Yield name, input and output of each product in turn: unitless (P, C), or STEP_VALUE times steps."""
-        inputs, maps = rulebook_inputs(tables), []
+        inputs, maps = rulebook_inputs(rulebooks), []
         missing = self.empty * STEP_VALUE
         for level in self.levels:
             for layer in level.convolutions:
@@ -114,9 +114,9 @@ class SparseBackbone(nn.Module):
         joined = torch.cat(maps, dim=1)
         yield HEAD, joined, self.product(HEAD)(joined)
 
-    def forward(self, features: Tensor, tables: NeckRulebooks[Tensor]) -> HeadMaps[Tensor]:
+    def forward(self, features: Tensor, rulebooks: NeckRulebooks[Tensor]) -> HeadMaps[Tensor]:
         """Run: pillar features (P, C) -> scores (H, A), boxes (H, 7A), directions (H, 2A) at H head cells."""
-        for _, _, output in self.passes(features, tables):
+        for _, _, output in self.passes(features, rulebooks):
             last = output
         return HeadMaps(*last.split(self.head_channels, dim=1))
 
@@ -145,7 +145,7 @@ JOINED = f"{HEAD}.joined"
 def export_sparse_backbone(
     backbone: SparseBackbone, path: Path, eight_bit: Collection[str] = (), *, steps: bool = False
 ) -> None:
-    """Write the graph: pillar features (P, C) and the int32 tables -> scores, boxes, directions of each head cell.
+    """Write the graph: pillar features (P, C) and the int32 rulebooks -> scores, boxes, directions of each head cell.
 
     Args:
         backbone: made with canvas steps and scaled to steps, if `steps`.
@@ -155,7 +155,7 @@ def export_sparse_backbone(
     """
     graph, maps = RowGraph(backbone.product, eight_bit), []
     row_type = np.dtype(np.uint8 if steps else np.float32)
-    rows = graph.take(PILLAR_FEATURES, helper.np_dtype_to_tensor_dtype(row_type), "pillars", backbone.channels)
+    rows = graph.add_input(PILLAR_FEATURES, helper.np_dtype_to_tensor_dtype(row_type), "pillars", backbone.channels)
     missing = backbone.empty.numpy().astype(row_type)
     for level in backbone.levels:
         for layer in level.convolutions:
@@ -171,19 +171,19 @@ def export_sparse_backbone(
     sizes = graph.constant(HEAD, "channels", np.array(backbone.head_channels, np.int64))
     graph.named("Split", HeadMaps._fields, outputs, sizes, axis=1)
     for name, channels in zip(HeadMaps._fields, backbone.head_channels, strict=True):
-        graph.give(name, TensorProto.FLOAT, "head_cells", channels)
+        graph.add_output(name, TensorProto.FLOAT, "head_cells", channels)
     graph.save(path, "sparse_backbone")
 
 
-def sparse_multiply_accumulates(backbone: SparseBackbone, tables: NeckRulebooks[NDArray[np.int32]]) -> int:
-    """Count the multiply-accumulates of the products on the scan of these tables, indices (M, 9)."""
-    inputs, total = rulebook_inputs(tables), 0
+def sparse_multiply_accumulates(backbone: SparseBackbone, rulebooks: NeckRulebooks[NDArray[np.int32]]) -> int:
+    """Count the multiply-accumulates of the products on the scan of these rulebooks, indices (M, 9)."""
+    inputs, total = rulebook_inputs(rulebooks), 0
     for level in backbone.levels:
         for layer in level.convolutions:
             rows = len(inputs[layer.table])
             total += rows * backbone.product(layer.name).weight.numel()
         total += rows * backbone.product(level.upsample).weight.numel()
-    return total + len(tables.head_cells) * backbone.product(HEAD).weight.numel()
+    return total + len(rulebooks.head_cells) * backbone.product(HEAD).weight.numel()
 
 
 def _joined(graph: RowGraph, maps: Sequence[str], places: Sequence[str], missing: NDArray[np.generic]) -> str:
@@ -195,7 +195,7 @@ def _joined(graph: RowGraph, maps: Sequence[str], places: Sequence[str], missing
     rows, indices, first = [], [], ""
     for number, (values, place) in enumerate(zip(maps, places, strict=True)):
         owner = f"head{number}"
-        graph.take(place, TensorProto.INT32, "head_cells")
+        graph.add_input(place, TensorProto.INT32, "head_cells")
         rows += [values, graph.constant(owner, "missing", missing)]
         if number:
             size = graph.node("Shape", owner, "size", maps[number - 1], start=0, end=1)

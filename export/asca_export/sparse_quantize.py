@@ -26,9 +26,9 @@ class SparseSample(NamedTuple):
 
     features: Tensor
     """(P, C) pillar features."""
-    tables: NeckRulebooks[Tensor]
+    rulebooks: NeckRulebooks[Tensor]
 
-    def in_steps(self, steps: CanvasSteps) -> "SparseSample":
+    def quantize_features(self, steps: CanvasSteps) -> "SparseSample":
         """Return the sample with features rounded to whole steps, times STEP_VALUE."""
         whole = (self.features / steps.scale + steps.empty).round().clamp(0, STEPS)
         return self._replace(features=whole * STEP_VALUE)

@@ -21,6 +21,6 @@ def in_turn(monkeypatch: pytest.MonkeyPatch) -> None:
         return done
 
     # Training answers to Ctrl-C, which only a main thread can.
-    monkeypatch.setattr(ablation_runs, "_at_once", lambda todo, work, *_: [work(one) for one in todo])
+    monkeypatch.setattr(ablation_runs, "_run_in_threads", lambda todo, work, *_: [work(one) for one in todo])
     monkeypatch.setattr(ablation_runs, "subprocess", SimpleNamespace(run=run, STDOUT=subprocess.STDOUT))
     monkeypatch.setattr(ablate_steps, "TIMED_ROUNDS", 2)

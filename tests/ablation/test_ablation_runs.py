@@ -78,7 +78,7 @@ def test_what_would_end_an_ablation_ends_it_before_anything_is_trained(
     tmp_path: Path, config: str, options: dict[str, Any], message: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     data = write_dataset(tmp_path / "data", 6, val_frames=3)
-    monkeypatch.setattr(ablation_runs, "_asca", lambda *_: pytest.fail("too late"))
+    monkeypatch.setattr(ablation_runs, "_run_command", lambda *_: pytest.fail("too late"))
     given = {"seeds": "0", "variants": "baseline,cpa_channel_lower_ious"} | options
     with pytest.raises(AscaError, match=message):
         ablate(config, data=data, out=tmp_path / "out", **given)
@@ -172,14 +172,14 @@ def _accuracies(text: str) -> list[str]:
 
 def test_a_damaged_note_of_the_base_is_one_line_and_can_be_deleted(tmp_path: Path) -> None:
     base = {"config": {"name": "small"}, "data": "data/sim"}
-    ablate_steps.claim(tmp_path, base)
+    ablate_steps.require_same_base(tmp_path, base)
     (tmp_path / "none" / "seed0").mkdir(parents=True)
     (tmp_path / "none" / "seed0" / "train.log").write_text(written_by("asca ablate") + "\n")
     note = tmp_path / "ablation.json"
     note.write_text(note.read_text()[:-5])
     with pytest.raises(TrainingError, match=r"ablation\.json: not what `asca ablate` wrote, or damaged .*; delete it"):
-        ablate_steps.claim(tmp_path, base)
+        ablate_steps.require_same_base(tmp_path, base)
     note.unlink()
-    ablate_steps.claim(tmp_path, base)
+    ablate_steps.require_same_base(tmp_path, base)
     with pytest.raises(TrainingError, match="another base"):
-        ablate_steps.claim(tmp_path, base | {"data": "other"})
+        ablate_steps.require_same_base(tmp_path, base | {"data": "other"})

@@ -93,8 +93,8 @@ def test_a_full_disk_is_named_and_ends_nothing(
         full.setattr(os, "replace", fail)
         assert hits(source) == [False, False]
     (record,) = caplog.records
-    said = record.getMessage()
-    assert "cache" in said and "No space left on device" in said and "NUMBA_CACHE_DIR" in said
+    message = record.getMessage()
+    assert "cache" in message and "No space left on device" in message and "NUMBA_CACHE_DIR" in message
     assert hits(source) == [False, False]
     assert hits(source) == [True, True]
 

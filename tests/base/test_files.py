@@ -191,8 +191,8 @@ def test_files_and_folders_are_synced_before_they_get_their_names(
         assert synced == []
     with atomic_directory(tmp_path / "b", *EXPORT) as folder:
         (folder / "bundle.json").write_text('{"file": ""}')
-    wanted = [file, tmp_path, folder / "bundle.json", folder, tmp_path]
-    assert synced == [str(path) for path in wanted]
+    expected = [file, tmp_path, folder / "bundle.json", folder, tmp_path]
+    assert synced == [str(path) for path in expected]
 
 
 @pytest.mark.skipif(os.name == "nt", reason="POSIX permissions")

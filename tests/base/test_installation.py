@@ -29,14 +29,14 @@ def test_of_a_wheel_the_advice_names_the_package(tmp_path: Path) -> None:
     (package.parent / "pyproject.toml").write_text('[project]\nname = "other"\n')
     code = "from asca_pillars.base.installation import *; print(install_command('train')); print(upgrade_advice())"
 
-    def said() -> list[str]:
+    def advice() -> list[str]:
         command = [sys.executable, "-c", code]
         done = subprocess.run(command, cwd=package.parent, env={}, check=True, capture_output=True, text=True)
         return done.stdout.splitlines()
 
-    assert said() == ["pip install 'asca-pillars[train]'", "install a newer asca-pillars"]
+    assert advice() == ["pip install 'asca-pillars[train]'", "install a newer asca-pillars"]
     (package.parent / "pyproject.toml").write_text('[project]\nname = "asca-pillars"\n')
-    assert said()[0] == f"pip install -e '{package.parent}[train]'"
+    assert advice()[0] == f"pip install -e '{package.parent}[train]'"
 
 
 def test_every_extra_that_is_advised_exists() -> None:

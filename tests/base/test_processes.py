@@ -15,7 +15,7 @@ import cv2
 import pytest
 
 from asca_pillars.base.errors import DatasetError, WorkerError
-from asca_pillars.base.processes import in_processes
+from asca_pillars.base.processes import map_in_processes
 
 
 def square(number: int) -> tuple[int, int, int]:
@@ -25,7 +25,7 @@ def square(number: int) -> tuple[int, int, int]:
 
 
 def squares(count: int, workers: int, at_once: int = 4) -> Iterator[tuple[int, int, int]]:
-    return in_processes(square, range(count), workers, "Squares", at_once=at_once, progress=False)
+    return map_in_processes(square, range(count), workers, "Squares", at_once=at_once, progress=False)
 
 
 def test_results_come_in_order_from_processes_of_one_thread(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -48,7 +48,7 @@ def test_nothing_is_started_for_one_process(count: int, workers: int) -> None:
 
 @pytest.mark.parametrize("workers", [1, 2])
 def test_the_error_of_a_job_is_raised(workers: int) -> None:
-    results = in_processes(square, [3, -1, 2], workers, "Squares", at_once=1, progress=False)
+    results = map_in_processes(square, [3, -1, 2], workers, "Squares", at_once=1, progress=False)
     assert next(results)[0] == 9
     with pytest.raises(DatasetError, match="-1: is negative"):
         next(results)
@@ -62,7 +62,7 @@ def killed(number: int) -> int:
 
 def test_a_process_that_is_killed_ends_the_work() -> None:
     """The kernel does that where memory runs out; the pool of the standard library then waits forever."""
-    results = in_processes(killed, range(40), 2, "Killed", progress=False)
+    results = map_in_processes(killed, range(40), 2, "Killed", progress=False)
     with pytest.raises(WorkerError, match=r"1 of 2 worker processes were killed, .*; use fewer workers"):
         list(results)
 
@@ -74,7 +74,7 @@ def unhurried(number: int) -> int:
 
 def test_a_process_that_is_killed_while_it_waits_ends_the_work() -> None:
     """In a pool of the standard library it takes the lock of the common queue with it."""
-    results = in_processes(unhurried, range(1000), 2, "Unhurried", at_once=1, progress=False)
+    results = map_in_processes(unhurried, range(1000), 2, "Unhurried", at_once=1, progress=False)
     process = next(results)
     os.kill(process, signal.SIGKILL)
     deadline = time.monotonic() + 30
@@ -99,7 +99,7 @@ def fails_oddly(number: int) -> int:
 
 def test_an_error_that_cannot_be_sent_ends_the_work() -> None:
     with pytest.raises(TypeError, match="second"):
-        list(in_processes(fails_oddly, range(40), 2, "Odd", progress=False))
+        list(map_in_processes(fails_oddly, range(40), 2, "Odd", progress=False))
 
 
 def test_a_process_that_cannot_be_started_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -119,10 +119,10 @@ def asleep(number: int) -> int:
 
 
 MAIN = """
-from asca_pillars.base.processes import in_processes
+from asca_pillars.base.processes import map_in_processes
 from tests.base.test_processes import asleep
 if __name__ == "__main__":
-    list(in_processes(asleep, range(100), 2, "Asleep", at_once=1, progress=False))
+    list(map_in_processes(asleep, range(100), 2, "Asleep", at_once=1, progress=False))
 """
 
 
@@ -143,7 +143,7 @@ def test_processes_end_with_the_one_that_started_them(tmp_path: Path) -> None:
 
 def test_the_job_is_sent_once(tmp_path: Path) -> None:
     job = Noting(tmp_path)
-    assert list(in_processes(job, range(8), 2, "Noting", at_once=1, progress=False)) == [0, 1, 2, 3, 4, 5, 6, 7]
+    assert list(map_in_processes(job, range(8), 2, "Noting", at_once=1, progress=False)) == [0, 1, 2, 3, 4, 5, 6, 7]
     assert len(list(tmp_path.iterdir())) == 2
 
 

@@ -24,15 +24,15 @@ model:
 def test_both_necks_are_exported_once(tmp_path: Path) -> None:
     (tmp_path / "tiny.yaml").write_text(CONFIG)
     export = partial(export_both, str(tmp_path / "tiny.yaml"), tmp_path / "bundles", int8=False)
-    said: list[str] = []
-    folders = export(progress=said.append)
+    remarks: list[str] = []
+    folders = export(progress=remarks.append)
     bundles = {neck: Detector(folder).bundle for neck, folder in folders.items()}
     for neck in ("dense", "sparse"):
         bundle = bundles[neck]
         assert isinstance(bundle, PillarBundle) and bundle.pillar.neck == neck and bundle.precision == "float32"
     assert bundles["sparse"].backbone_gmac < bundles["dense"].backbone_gmac
-    count = len(said)
-    assert export(progress=said.append) == folders and len(said) == count > 0
+    count = len(remarks)
+    assert export(progress=remarks.append) == folders and len(remarks) == count > 0
 
 
 def test_detectors_see_the_same_views_in_turn() -> None:

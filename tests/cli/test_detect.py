@@ -23,9 +23,9 @@ def test_dropped_points_and_arithmetic_are_said(tmp_path: Path, capsys: pytest.C
     points[:7, 0] = np.nan
     np.save(tmp_path / "scan.npy", points)
     detect([tmp_path / "scan.npy"], out=tmp_path / "out", threads=1)
-    said = " ".join(capsys.readouterr().out.split())
-    assert "scan.npy: 7 points are not finite and were dropped" in said and said.count("not finite") == 1
-    assert "cpu int8, 1 threads" in said
+    output = " ".join(capsys.readouterr().out.split())
+    assert "scan.npy: 7 points are not finite and were dropped" in output and output.count("not finite") == 1
+    assert "cpu int8, 1 threads" in output
     written = json.loads((tmp_path / "out" / "scan.json").read_text())
     assert (written["points_not_finite"], written["points"]) == (7, len(points) - 7)
 
@@ -181,8 +181,8 @@ def test_a_damaged_calibration_is_said_and_the_scans_are_detected(
     split = KittiSplit(write_dataset(tmp_path / "kitti", 3))
     split.calib_path("000001").write_text("P2: 1 2\n")
     detect([split.scan_path("000000").parent], out=tmp_path / "out", threads=1)
-    said = " ".join(capsys.readouterr().out.split())
-    assert "no KITTI text is written: " in said and "000001.txt: " in said
+    output = " ".join(capsys.readouterr().out.split())
+    assert "no KITTI text is written: " in output and "000001.txt: " in output
     written = {path.name for path in (tmp_path / "out").iterdir()}
     assert written >= {"000000.txt", "000001.json", "000001_bev.png", "000002.txt"} and "000001.txt" not in written
     lines = (tmp_path / "out" / "detections.jsonl").read_text().splitlines()

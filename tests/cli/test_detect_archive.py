@@ -213,7 +213,7 @@ def test_a_scan_that_ends_its_worker_is_a_line(
         if len(shard.items) == 1 and shard.items[0][0] == deadly:
             yield Outcome(shard, died="worker")
         elif any(path == deadly for path, _ in shard.items):
-            for half in reversed(shard.halves):
+            for half in reversed(shard.split):
                 yield from end(half)
         else:
             yield here.done(shard)

@@ -130,7 +130,7 @@ def test_what_does_not_fit_is_refused_before_the_work(folder: Path, drive: Path,
         ([drive], {"rate": 5.0}, ConfigError, "--rate 5: is for folders of scans"),
         ([drive], {"times": times}, ConfigError, "--times .*: is for folders of scans"),
     ]
-    for paths, options, kind, said in cases:
-        with pytest.raises(kind, match=said):
+    for paths, options, kind, message in cases:
+        with pytest.raises(kind, match=message):
             detect(paths, out=tmp_path / "out", threads=1, **options)
     assert not (tmp_path / "out").exists()

@@ -51,8 +51,8 @@ def test_a_line_for_each_scan_with_its_time(drive: Path, tmp_path: Path, capsys:
     ranges_m = [list(spec.ranges.x_m), list(spec.ranges.y_m)]
     assert [line["detector"] for line in lines] == [{"classes": list(spec.class_names), "ranges_m": ranges_m}] * SCANS
     assert {path.name for path in tmp_path.iterdir()} == {"detections.jsonl", "recording.json"}
-    said = capsys.readouterr().out
-    assert "/lidar: 5 scans" in said and "ms of CPU per scan" in said
+    output = capsys.readouterr().out
+    assert "/lidar: 5 scans" in output and "ms of CPU per scan" in output
     # The same boxes as of the scan alone.
     np.save(tmp_path / "scan.npy", POINTS)
     detect([tmp_path / "scan.npy"], out=tmp_path / "alone", threads=1, pictures=False)
@@ -194,7 +194,7 @@ def _dies(*_: object) -> Iterator[None]:
 def journal(drive: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A journal of all scans, in tmp_path/killed."""
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(steps, "tracked", _dies)
+        patch.setattr(steps, "track_results", _dies)
         run(drive, tmp_path / "killed", track=True, foxglove=tmp_path / "killed" / "boxes.mcap")
     return tmp_path / "killed" / JOURNAL_FILE
 
@@ -330,7 +330,7 @@ def test_a_journal_of_other_settings_is_not_gone_on_with(
     drive: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(steps, "tracked", _dies)
+        patch.setattr(steps, "track_results", _dies)
         run(drive, tmp_path, score=["0.9"])
     assert (tmp_path / JOURNAL_FILE).exists() and "beginning anew" not in capsys.readouterr().out
     assert min(box["score"] for line in run(drive, tmp_path, score=["0.5"]) for box in line["boxes"]) < 0.9
@@ -351,7 +351,7 @@ def test_a_journal_of_another_pose_is_not_gone_on_with(
     pose = tmp_path / "pose.txt"
     pose.write_text("1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n")
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(steps, "tracked", _dies)
+        patch.setattr(steps, "track_results", _dies)
         run(drive, tmp_path / "out", pose=pose)
     pose.write_text("1 0 0 0\n0 1 0 0\n0 0 1 0.5\n0 0 0 1\n")
     detected: list[int] = []
@@ -364,7 +364,7 @@ def test_a_journal_of_another_pose_is_not_gone_on_with(
 def test_results_in_the_folder_of_a_bag_are_no_part_of_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_recording(tmp_path / "bag", iter([(time_ns, POINTS) for time_ns in stamps(2)]))
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(steps, "tracked", _dies)
+        patch.setattr(steps, "track_results", _dies)
         run(tmp_path / "bag", tmp_path / "bag" / "results")
     monkeypatch.setattr(Journal, "add", lambda *_: pytest.fail("begun anew"))
     assert len(run(tmp_path / "bag", tmp_path / "bag" / "results")) == 2

@@ -62,8 +62,8 @@ def test_what_cannot_be_a_video_is_refused_before_the_work(
         ({"video": tmp_path / "a.mp4", "video_view": "side"}, ConfigError, "--video-view side: give above or chase"),
         ({"video": tmp_path / "a.mp4", "cluster": "local"}, ConfigError, "is not made with --cluster"),
     ]
-    for options, kind, said in cases:
-        with pytest.raises(kind, match=said):
+    for options, kind, message in cases:
+        with pytest.raises(kind, match=message):
             detect([folder], out=tmp_path / "out", threads=1, **options)
     assert not (tmp_path / "out").exists()
     monkeypatch.undo()

@@ -111,8 +111,8 @@ def test_another_detector_is_drawn_beside_the_first(
     assert title(out / "gallery" / "index.html") == f"{found} and newer: where they differ most"
     counts = {f"missed, {found}": 0, f"false, {found}": 0, "missed, newer": 2, "false, newer": 0}
     assert cards(index) == {"000002": {"difference": 2} | counts}
-    said = " ".join(capsys.readouterr().out.split())
-    assert f"--compare {other}: evaluated on 1 of 2 frames: no prediction file for 000001" in said
+    output = " ".join(capsys.readouterr().out.split())
+    assert f"--compare {other}: evaluated on 1 of 2 frames: no prediction file for 000001" in output
 
 
 def test_the_shipped_bundle_and_its_predictions_score_the_same(

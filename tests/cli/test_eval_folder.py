@@ -60,9 +60,9 @@ def test_a_file_of_somebody_else_is_not_replaced(
     (out / name).parent.mkdir(parents=True, exist_ok=True)
     (out / name).write_text(FOREIGN[name])
     before = contents(out)
-    said = refused(**texts, out=out)
+    output = refused(**texts, out=out)
     expected = f"{name}: `asca eval` did not write it" if earlier else "nothing that `asca eval` wrote"
-    assert expected in said, said
+    assert expected in output, output
     assert contents(out) == before
 
 

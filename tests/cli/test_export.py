@@ -97,7 +97,7 @@ def test_what_has_no_masked_form_is_refused_before_scans_are_read(with_weights: 
 
 def test_what_cannot_be_exported_is_one_line(with_weights: Path, scans: Path, tmp_path: Path) -> None:
     out, tail = tmp_path / "out", ("-o", tmp_path / "out", "--scans", scans)
-    for arguments, said in (
+    for arguments, message in (
         (("asca_sim_int8", *tail), "asca_sim_int8: holds no weights.ckpt"),
         ((tmp_path / "nowhere", *tail), "no such folder"),
         ((with_weights, "--dense-neck", "--int8", *tail), "--dense-neck with --int8"),
@@ -105,5 +105,5 @@ def test_what_cannot_be_exported_is_one_line(with_weights: Path, scans: Path, tm
         ((with_weights, "--golden", "--trained-on", "foo", "-o", out), "--trained-on is for a checkpoint"),
     ):
         refused = run_here("export", *arguments)
-        assert refused.returncode > 1 and said in refused.stderr, refused.stderr
+        assert refused.returncode > 1 and message in refused.stderr, refused.stderr
         assert "Traceback" not in refused.stderr and not out.exists()

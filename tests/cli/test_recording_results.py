@@ -7,7 +7,7 @@ import pytest
 
 from asca_deploy import Detections
 from asca_deploy.recordings.journal import Journal, ScanResult
-from asca_deploy.recordings.results import said_of_stamps, tracked, tracking_order
+from asca_deploy.recordings.results import timestamp_note, track_results, tracking_order
 from asca_deploy.tracker import Tracker
 
 SECOND = 10**9
@@ -39,9 +39,9 @@ def test_a_drive_that_is_played_again_or_a_clock_that_was_set_begins_another() -
 
 
 def test_stamps_that_go_back_or_jump_are_counted() -> None:
-    assert said_of_stamps(REGULAR) is None and said_of_stamps(REGULAR[:1]) is None
-    said = said_of_stamps(replaced(5, REGULAR[0] + 3600 * SECOND))
-    assert said is not None and said.startswith("of 12 time stamps 1 go back and 1 jump ahead by more than 2 s: ")
+    assert timestamp_note(REGULAR) is None and timestamp_note(REGULAR[:1]) is None
+    note = timestamp_note(replaced(5, REGULAR[0] + 3600 * SECOND))
+    assert note is not None and note.startswith("of 12 time stamps 1 go back and 1 jump ahead by more than 2 s: ")
 
 
 def found(number: int, time_ns: int) -> ScanResult:
@@ -59,7 +59,7 @@ def test_a_scan_out_of_order_ends_no_track(tmp_path: Path, order: list[int]) -> 
         for number, index in enumerate(order):
             journal.add(found(number, REGULAR[index]))
         journal.add(ScanResult(12, REGULAR[11], "lidar", None, "torn"))
-        results = list(tracked(journal, Tracker()))
+        results = list(track_results(journal, Tracker()))
     assert [one.number for one in results] == list(range(12)), "lines stay in the order of the recording"
     assert [one.time_ns for one in results] == [REGULAR[index] for index in order]
     assert {tuple(one.tracks.track_ids.tolist()) for one in results if one.tracks is not None} == {(0,)}

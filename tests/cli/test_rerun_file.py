@@ -164,5 +164,5 @@ def test_what_rerun_cannot_write_ends_the_run(
     capsys.readouterr()
     lines = run(drive, tmp_path / "out", track=False)  # what was detected is not detected again, and is counted
     counts = Counter(box["class"] for line in lines for box in line["boxes"])
-    said = " ".join(capsys.readouterr().out.split())
-    assert f"{SCANS} scans, in all {counts['Car']} Car, {counts['Pedestrian']} Pedestrian" in said
+    output = " ".join(capsys.readouterr().out.split())
+    assert f"{SCANS} scans, in all {counts['Car']} Car, {counts['Pedestrian']} Pedestrian" in output

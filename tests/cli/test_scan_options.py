@@ -76,11 +76,11 @@ def test_a_folder_has_one_reflectance_scale(tmp_path: Path, sample: NDArray[np.f
         write_scan(folder / f"{number}.bin", sample[::10] * np.array([1, 1, 1, brightness], np.float32))
     paths = sorted(folder.iterdir())
     scan_input = ScanInput(ScanSettings(), paths)
-    assert any("0..255" in text for text in scan_input.said)
+    assert any("0..255" in text for text in scan_input.notes)
     assert [scan_input.read(path).notes.reflectance_scale for path in paths] == [255, 255]
     stated = ScanInput(ScanSettings(reflectance_scale=100.0), paths)
     assert [stated.read(path).notes.reflectance_scale for path in paths] == [100, 100]
-    assert not stated.said
+    assert not stated.notes
 
 
 def test_the_height_of_several_scans(tmp_path: Path, sample: NDArray[np.float32]) -> None:
@@ -89,7 +89,7 @@ def test_the_height_of_several_scans(tmp_path: Path, sample: NDArray[np.float32]
     (tmp_path / "3.bin").write_bytes(b"damaged")
     scan_input = ScanInput(ScanSettings(sensor_height="auto"), sorted(tmp_path.iterdir()))
     assert scan_input.mounting.sensor_height_m == pytest.approx(1.73, abs=0.05)
-    assert any("from 3 scans" in text for text in scan_input.said)
+    assert any("from 3 scans" in text for text in scan_input.notes)
 
 
 def write_folder(folder: Path, sample: NDArray[np.float32], shown: list[bool]) -> Path:
@@ -116,9 +116,9 @@ def test_a_scan_without_ground_is_left_out_of_the_height(
     folder = write_folder(tmp_path / "sweeps", sample, shown)
     scan_input = ScanInput(ScanSettings(sensor_height="auto"), sorted(folder.iterdir()))
     assert scan_input.mounting.sensor_height_m == pytest.approx(1.73, abs=0.05)
-    (said,) = [text for text in scan_input.said if text.startswith("sensor height: ")]
-    assert f"from {estimated} scan" in said
-    assert left_out in said.split("; left out: ")[1]
+    (note,) = [text for text in scan_input.notes if text.startswith("sensor height: ")]
+    assert f"from {estimated} scan" in note
+    assert left_out in note.split("; left out: ")[1]
 
 
 def test_a_height_is_refused_where_no_scan_shows_the_ground(tmp_path: Path, sample: NDArray[np.float32]) -> None:

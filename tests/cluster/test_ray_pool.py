@@ -11,8 +11,8 @@ import pytest
 
 from asca_pillars.base.errors import ClusterError
 from asca_pillars.cluster import ray_pool
-from asca_pillars.cluster.run_shards import run_each, run_shards
-from asca_pillars.cluster.shards import Shard, cut, process_shards
+from asca_pillars.cluster.run_shards import run_items, run_shards
+from asca_pillars.cluster.shards import Shard, make_shards, process_shards
 
 pytest.importorskip("ray", reason="needs pip install -e '.[cluster]'")
 
@@ -56,7 +56,7 @@ def test_all_is_done_while_a_machine_and_workers_die(cluster: Any, tmp_path: Pat
     seen, work = tmp_path / "run.json", tmp_path / "work"
     seen.write_text("{}")
     work.mkdir()
-    shards = [*cut(range(10, 40), 2), Shard(100, (DEADLY,))]
+    shards = [*make_shards(range(10, 40), 2), Shard(100, (DEADLY,))]
     (node,) = cluster.worker_nodes
     outcomes = []
     for outcome in run_shards(
@@ -95,7 +95,7 @@ def test_each_item_is_done(cluster: Any, tmp_path: Path) -> None:
     left = out / ".1.asca-00000000"
     left.touch()
     job = partial(touch, out)
-    run_each(job, range(5), cluster.address, shard_size=2, seen=seen, folders=[out], title="Touching", progress=False)
+    run_items(job, range(5), cluster.address, shard_size=2, seen=seen, folders=[out], title="Touching", progress=False)
     assert {path.name for path in out.iterdir()} == set("01234"), "and what a killed writer left is gone"
 
 

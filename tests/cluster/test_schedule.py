@@ -8,7 +8,7 @@ from typing import Literal
 import pytest
 
 from asca_pillars.base.errors import BundleError
-from asca_pillars.cluster.shards import TRIES, Outcome, Shard, cut, process_shards
+from asca_pillars.cluster.shards import TRIES, Outcome, Shard, make_shards, process_shards
 
 
 class MadeUpPool:
@@ -42,7 +42,7 @@ def died(shard: Shard, what: Literal["worker", "machine"] = "worker") -> Outcome
 def test_all_are_done_once_while_machines_die() -> None:
     rng = random.Random(0)
     pool = MadeUpPool(lambda shard: died(shard, "machine") if rng.random() < 0.4 else done(shard))
-    shards = cut(range(100), 7)
+    shards = make_shards(range(100), 7)
     outcomes = list(process_shards(shards, pool))
     assert sorted(outcome.shard for outcome in outcomes) == shards
     assert sum(outcome.result or 0 for outcome in outcomes) == sum(range(100))
@@ -51,7 +51,7 @@ def test_all_are_done_once_while_machines_die() -> None:
 
 def test_the_item_that_ends_its_workers_is_found_and_the_others_are_done() -> None:
     pool = MadeUpPool(lambda shard: died(shard) if {13, 77} & set(shard.items) else done(shard))
-    outcomes = list(process_shards(cut(range(100), 20), pool))
+    outcomes = list(process_shards(make_shards(range(100), 20), pool))
     assert sorted(item for outcome in outcomes for item in outcome.shard.items) == list(range(100))
     assert sorted(outcome.shard.items for outcome in outcomes if outcome.died) == [(13,), (77,)]
     assert max(pool.begun.values()) == TRIES["worker"]
@@ -75,7 +75,10 @@ def test_a_bad_moment_of_the_file_system_is_waited_out_and_a_full_disk_is_not() 
         tries[shard.name] += 1
         return done(shard) if tries[shard.name] > good_after else Outcome(shard, error=OSError("no space"))
 
-    assert [one.result for one in process_shards(cut([1, 2], 1), MadeUpPool(lambda shard: end(shard, 2)))] == [2, 1]
+    assert [one.result for one in process_shards(make_shards([1, 2], 1), MadeUpPool(lambda shard: end(shard, 2)))] == [
+        2,
+        1,
+    ]
     tries.clear()
     with pytest.raises(OSError, match="no space"):
         list(process_shards([Shard(0, (1,))], MadeUpPool(lambda shard: end(shard, 3))))

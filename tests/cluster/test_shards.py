@@ -9,24 +9,24 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from asca_pillars.base.errors import OutputError
-from asca_pillars.cluster.shards import Shard, ShardFolder, cut
+from asca_pillars.cluster.shards import Shard, ShardFolder, make_shards
 
 
 @given(items=st.lists(st.integers(), max_size=40), size=st.integers(1, 12))
 def test_shards_hold_every_item_once_and_in_order(items: list[int], size: int) -> None:
-    shards = cut(items, size)
+    shards = make_shards(items, size)
     assert [item for shard in shards for item in shard.items] == items
     assert all(items[shard.first : shard.first + len(shard.items)] == list(shard.items) for shard in shards)
     assert len({shard.name for shard in shards}) == len(shards)
     for shard in shards:
         if len(shard.items) > 1:
-            first, second = shard.halves
+            first, second = shard.split
             assert first.items and second.items and first.items + second.items == shard.items
             assert (first.first, second.first) == (shard.first, shard.first + len(first.items))
 
 
 def test_other_items_have_another_name_and_more_items_keep_the_names_before_them() -> None:
-    before, after = cut(["a", "b", "c", "d"], 2), cut(["a", "b", "c", "x", "y"], 2)
+    before, after = make_shards(["a", "b", "c", "d"], 2), make_shards(["a", "b", "c", "x", "y"], 2)
     assert before[0].name == after[0].name and before[1].name != after[1].name
     assert Shard(0, (("a", 255.0),)).name != Shard(0, (("a", 1.0),)).name
 
@@ -48,7 +48,7 @@ def test_results_appear_when_all_are_written(tmp_path: Path) -> None:
 
 def test_parts_become_the_shard(tmp_path: Path) -> None:
     folder, shard = ShardFolder(tmp_path), Shard(4, ("a", "b", "c"))
-    first, second = shard.halves
+    first, second = shard.split
     for part in (second, first):
         folder.write(part, [f"{item}\n" for item in part.items])
     folder.join(shard, [second, first])
@@ -75,7 +75,7 @@ def flipped(content: bytes) -> bytes:
     ],
 )
 def test_a_damaged_result_is_done_again_and_not_merged(tmp_path: Path, damage: Callable[[bytes], bytes]) -> None:
-    folder, shards = ShardFolder(tmp_path), cut(["a", "b", "c", "d"], 3)
+    folder, shards = ShardFolder(tmp_path), make_shards(["a", "b", "c", "d"], 3)
     for shard in shards:
         folder.write(shard, [json.dumps({"scan": item}) + "\n" for item in shard.items])
     assert folder.done(shards) == {shard.name for shard in shards}
@@ -87,7 +87,7 @@ def test_a_damaged_result_is_done_again_and_not_merged(tmp_path: Path, damage: C
 
 
 def test_a_result_under_the_name_of_another_is_none(tmp_path: Path) -> None:
-    folder, shards = ShardFolder(tmp_path), cut(["a", "b", "c", "d"], 2)
+    folder, shards = ShardFolder(tmp_path), make_shards(["a", "b", "c", "d"], 2)
     folder.write(shards[0], ["1\n", "2\n"])
     (tmp_path / f"{shards[0].name}.jsonl").rename(tmp_path / f"{shards[1].name}.jsonl")
     assert folder.done(shards) == set()

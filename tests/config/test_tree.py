@@ -265,12 +265,12 @@ def test_names_of_classes_differ_by_more_than_case(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("wanted", "message"),
+    ("proportions", "message"),
     [
         ("{Lorry: 1}", r"augment.insert.proportions.Lorry: no such class; there are Car, Pedestrian, Cyclist"),
         ("{Car: 0}", r"augment.insert.proportions: all are 0; set augment.insert.method=none to insert nothing"),
     ],
 )
-def test_proportions_that_cannot_be(tmp_path: Path, wanted: str, message: str) -> None:
-    path = write(tmp_path, f"augment: {{insert: {{proportions: {wanted}}}}}")
+def test_proportions_that_cannot_be(tmp_path: Path, proportions: str, message: str) -> None:
+    path = write(tmp_path, f"augment: {{insert: {{proportions: {proportions}}}}}")
     assert refusal(path) == f"{path}: {message}"

@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from asca_pillars.config.tree import AugmentConfig
-from asca_pillars.data.augment import FEWEST_POINTS, corrupt_objects, lose_reflectance
+from asca_pillars.data.augment import FEWEST_POINTS, corrupt_objects, drop_reflectance
 from asca_pillars.geometry.boxes import points_in_boxes
 from tests.helpers.scenes import make_scene
 
@@ -27,7 +27,7 @@ def test_off_draws_nothing() -> None:
     rng = np.random.default_rng(0)
     assert corrupt_objects(POINTS, BOXES, AugmentConfig(), rng) is POINTS
     points = POINTS.copy()
-    lose_reflectance(points, AugmentConfig(), rng)
+    drop_reflectance(points, AugmentConfig(), rng)
     assert np.array_equal(points, POINTS)
     assert rng.bit_generator.state == np.random.default_rng(0).bit_generator.state
 
@@ -99,7 +99,7 @@ def test_reflectance_is_lost_in_part_or_is_one_value() -> None:
     bright[:, 3] = np.linspace(0.2, 0.9, len(bright))
     for seed in range(200):
         points = bright.copy()
-        lose_reflectance(points, config(reflectance_loss_probability=0.5), np.random.default_rng(seed))
+        drop_reflectance(points, config(reflectance_loss_probability=0.5), np.random.default_rng(seed))
         assert np.array_equal(points[:, :3], bright[:, :3])
         same += np.array_equal(points, bright)
         constant += np.ptp(points[:, 3]) == 0

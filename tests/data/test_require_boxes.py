@@ -40,7 +40,7 @@ def test_labels_that_are_right_pass(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         (str.lower, r"the labels spell them 'car', 'pedestrian', 'cyclist'.* model\.spec\.classes"),
         (lambda _: "", "none at all"),
@@ -49,9 +49,9 @@ def test_labels_that_are_right_pass(tmp_path: Path) -> None:
         (lambda text: re.sub(r"(?m)^((\S+ ){13})\S+", r"\g<1>300.00", text), r"lie outside .*model\.spec\.grid"),
     ],
 )
-def test_no_box_of_any_class(change: Callable[[str], str], said: str, tmp_path: Path) -> None:
+def test_no_box_of_any_class(change: Callable[[str], str], message: str, tmp_path: Path) -> None:
     root = rewritten(tmp_path / "data", change)
-    with pytest.raises(DatasetError, match=f"list `train` has no box of Car, Pedestrian, Cyclist: .*{said}"):
+    with pytest.raises(DatasetError, match=f"list `train` has no box of Car, Pedestrian, Cyclist: .*{message}"):
         train(CONFIG, root, tmp_path / "run")
     assert not list((tmp_path / "run").glob("*")), "nothing was begun"
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
 
 from asca_deploy.bundle import CanvasFormat, PillarBundle, PillarSection, Provenance
-from asca_deploy.manifest import essentials, graph_files, write_bundle_manifest
+from asca_deploy.manifest import graph_files, graph_metadata, write_bundle_manifest
 from asca_deploy.pillar.graphs import PILLAR_FEATURES
 from asca_pillars.ops.pillar.grid import PillarGrid
 from asca_pillars.ops.pillar.neck_rulebooks import MaskRule
@@ -180,7 +180,7 @@ def sign(folder: Path, bundle: PillarBundle) -> None:
     """Stamp the graphs in `folder` with the essentials of `bundle`, and write it with their SHA-256."""
     for name in ("encoder.onnx", "backbone.onnx"):
         model = onnx.load(folder / name)
-        helper.set_model_props(model, {key: json.dumps(value) for key, value in essentials(bundle).items()})
+        helper.set_model_props(model, {key: json.dumps(value) for key, value in graph_metadata(bundle).items()})
         onnx.save(model, folder / name)
     write_bundle_manifest(folder, replace(bundle, graphs=graph_files(folder)))
 

@@ -14,7 +14,7 @@ import pytest
 from numpy.typing import NDArray
 
 from asca_deploy import sample_scan_path, shipped_bundles
-from asca_deploy.around import about_ground, merge, turns_around, widened
+from asca_deploy.around import about_ground, merge, turns_around, widen_ranges
 from asca_deploy.bundle import PillarBundle
 from asca_deploy.golden import write_golden
 from asca_deploy.manifest import load_pillar_bundle
@@ -216,8 +216,8 @@ def test_as_many_passes_or_as_wide_ranges_as_python_takes(camera_view: bool) -> 
         bundle = load_pillar_bundle(shipped_bundles()[name])
         manifest = json.loads((shipped_bundles()[name] / "bundle.json").read_text())
         manifest["expected_input"]["camera_view"] = camera_view
-        found = call("around.js", "widened", [manifest])[0]["result"]
-        looked = widened(replace(bundle, expected_input=replace(bundle.expected_input, camera_view=camera_view)))
+        found = call("around.js", "widenRanges", [manifest])[0]["result"]
+        looked = widen_ranges(replace(bundle, expected_input=replace(bundle.expected_input, camera_view=camera_view)))
         assert isinstance(looked, PillarBundle)
         limits, grid = looked.spec.limits, looked.spec.grid
         assert found["grid"] | {"x_range_m": [*grid.x_range_m], "y_range_m": [*grid.y_range_m]} == found["grid"]

@@ -276,8 +276,8 @@ def test_a_package_that_is_none(made_up_package: Path, tmp_path: Path, monkeypat
         find_ort_web(Path("gone.tgz"))
     (made_up_package / "package.json").write_text('{"name": "other", "version": "1"}')
     (tmp_path / "torn.tgz").write_bytes(b"torn")
-    for package, said in ((made_up_package, "npm's package other"), (tmp_path / "torn.tgz", "is not npm's package")):
-        with pytest.raises(ConfigError, match=said):
+    for package, message in ((made_up_package, "npm's package other"), (tmp_path / "torn.tgz", "is not npm's package")):
+        with pytest.raises(ConfigError, match=message):
             write_page(tmp_path / "page", bundle, sample_scan_path(), package)
     assert not (tmp_path / "page").exists()
 

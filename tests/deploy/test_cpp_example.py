@@ -104,8 +104,8 @@ def test_tables_are_those_of_python(build_tables: Path, rule: MaskRule) -> None:
     answer = subprocess.run([build_tables, str(ny), str(nx), rule], input=given, check=True, capture_output=True)
     values = np.frombuffer(answer.stdout, np.int32)
     for cells in scans:
-        tables = NeckRulebookBuilder(ny, nx, rule).build(cells)
-        expected = {**rulebook_inputs(tables), "head_cells": tables.head_cells}
+        rulebooks = NeckRulebookBuilder(ny, nx, rule).build(cells)
+        expected = {**rulebook_inputs(rulebooks), "head_cells": rulebooks.head_cells}
         for name, table in expected.items():
             if name.startswith("first") and (rule, name) != ("fine", "first_0"):
                 table = table[:0]  # where nothing grows a graph reads `same`
@@ -181,7 +181,7 @@ def test_mistakes_are_one_line(detect: Path, tiny_bundle: Path, tmp_path: Path) 
         spec = manifest["spec"]
         spec[key] = {**spec[key], **value} if isinstance(value, dict) else value
         (folder / "bundle.json").write_text(json.dumps(manifest))
-    for arguments, said in (
+    for arguments, message in (
         ([tmp_path, sample_scan_path()], "bundle.json: cannot be read"),
         ([pooled, sample_scan_path()], "pooled: needs schema 3, kind pillar and a warped map"),
         ([every, sample_scan_path()], "every: needs anchors at cell centers with one score for each"),
@@ -190,4 +190,4 @@ def test_mistakes_are_one_line(detect: Path, tiny_bundle: Path, tmp_path: Path) 
     ):
         result = subprocess.run([detect, *arguments], capture_output=True, text=True)
         assert result.returncode == 2
-        assert said in result.stderr and result.stderr.count("\n") == 1
+        assert message in result.stderr and result.stderr.count("\n") == 1

@@ -83,7 +83,7 @@ def test_written_again_and_only_over_itself(tiny_bundle: Path, scan_path: Path, 
 
 
 @pytest.mark.parametrize(
-    ("options", "said"),
+    ("options", "message"),
     [
         (["--golden", "--int8"], "--int8 is for a checkpoint"),
         (["--golden", "--score", "Car=0.3"], "--score is for a checkpoint"),
@@ -91,7 +91,7 @@ def test_written_again_and_only_over_itself(tiny_bundle: Path, scan_path: Path, 
         (["--ort-web", "x.tgz"], "--ort-web goes with --browser"),
     ],
 )
-def test_options_that_do_not_go_together(tiny_bundle: Path, tmp_path: Path, options: list[str], said: str) -> None:
+def test_options_that_do_not_go_together(tiny_bundle: Path, tmp_path: Path, options: list[str], message: str) -> None:
     result = CliRunner().invoke(app, ["export", str(tiny_bundle), "-o", str(tmp_path / "out"), *options])
     assert isinstance(result.exception, ConfigError)
-    assert said in str(result.exception)
+    assert message in str(result.exception)

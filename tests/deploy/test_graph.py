@@ -11,7 +11,7 @@ from asca_deploy.manifest import load_pillar_bundle
 from asca_deploy.providers import Provider
 from asca_pillars.base.errors import BundleError
 from tests.deploy.conftest import needs_openvino, sign
-from tests.deploy.spoiled_graph import respoil
+from tests.deploy.corrupt_graph import corrupt_graph
 
 by_provider = pytest.mark.parametrize("provider", ["cpu", pytest.param("openvino", marks=needs_openvino)])
 
@@ -26,17 +26,17 @@ def rename(model: onnx.ModelProto, old: str, new: str) -> None:
 
 @by_provider
 def test_unknown_input(bundle_copy: Path, provider: Provider) -> None:
-    respoil(bundle_copy, "backbone.onnx", lambda model: rename(model, "canvas", "image"))
+    corrupt_graph(bundle_copy, "backbone.onnx", lambda model: rename(model, "canvas", "image"))
     with pytest.raises(BundleError, match=r"backbone\.onnx has an unknown input `image`, the runtime knows canvas"):
         Detector(bundle_copy, provider=provider)
-    respoil(bundle_copy, "encoder.onnx", lambda model: rename(model, "pillar_index", "pillar_of_point"))
+    corrupt_graph(bundle_copy, "encoder.onnx", lambda model: rename(model, "pillar_index", "pillar_of_point"))
     with pytest.raises(BundleError, match=r"encoder\.onnx has an unknown input `pillar_of_point`"):
         Detector(bundle_copy, provider=provider)
 
 
 @by_provider
 def test_missing_output(bundle_copy: Path, provider: Provider) -> None:
-    respoil(bundle_copy, "backbone.onnx", lambda model: rename(model, "directions", "yaw_bins"))
+    corrupt_graph(bundle_copy, "backbone.onnx", lambda model: rename(model, "directions", "yaw_bins"))
     with pytest.raises(BundleError, match=r"backbone\.onnx has no output `directions`, only .*yaw_bins"):
         Detector(bundle_copy, provider=provider)
 
@@ -50,7 +50,7 @@ def test_outputs_are_found_by_name_not_by_order(
         del model.graph.output[:]
         model.graph.output.extend(outputs)
 
-    respoil(bundle_copy, "backbone.onnx", turn_round)
+    corrupt_graph(bundle_copy, "backbone.onnx", turn_round)
     turned, straight = Detector(bundle_copy, provider=provider)(scan), Detector(tiny_bundle, provider=provider)(scan)
     assert len(straight) > 3
     assert (turned.boxes == straight.boxes).all()
@@ -87,7 +87,7 @@ def test_opset_from_the_future(bundle_copy: Path) -> None:
     def raise_opset(model: onnx.ModelProto) -> None:
         model.opset_import[0].version = 999
 
-    respoil(bundle_copy, "backbone.onnx", raise_opset)
+    corrupt_graph(bundle_copy, "backbone.onnx", raise_opset)
     with pytest.raises(BundleError, match=r"cannot run .*backbone\.onnx: .*Opset 999.*upgrade") as caught:
         Detector(bundle_copy)
     assert "\n" not in str(caught.value)

@@ -95,14 +95,14 @@ def test_points_that_say_nothing(tmp_path: Path) -> None:
 def test_what_is_printed_and_written(folder: Path) -> None:
     report = folder / "report.json"
     for _ in range(2):  # its own file is replaced
-        said = invoke("inspect", folder, "--json", report, "-n", 2)
-    assert "2 of 3 scans measured" in said and "--around" in said
+        output = invoke("inspect", folder, "--json", report, "-n", 2)
+    assert "2 of 3 scans measured" in output and "--around" in output
     written = json.loads(report.read_text())
     assert written["inspected"] == 2 and written["findings"] and written["expected"]["camera_view"] is True
     assert written["height"]["scans"] == 2 and written["model"] == "asca_sim_int8"
     write_scan(folder / "own" / "1.bin", POINTS[POINTS[:, 0] > 0])
-    said = invoke("inspect", folder / "own" / "1.bin", "--bundle", "asca_small_sparse_sim")
-    assert "against asca_small_sparse_sim" in said and said.endswith("Nothing to warn of.\n")
+    output = invoke("inspect", folder / "own" / "1.bin", "--bundle", "asca_small_sparse_sim")
+    assert "against asca_small_sparse_sim" in output and output.endswith("Nothing to warn of.\n")
 
 
 def test_options_that_do_not_go_together(folder: Path) -> None:
@@ -167,8 +167,8 @@ def test_a_recording_in_the_terminal(odd: Path) -> None:
 def test_a_packed_recording_says_so(odd: Path) -> None:
     packed = odd.with_suffix(".mcap.gz")
     packed.write_bytes(gzip.compress(odd.read_bytes()))
-    said = invoke("inspect", packed, "--topic", "/rear")
-    assert f"{packed}: unpacked to " in said and f"warning: {packed}" not in said
+    output = invoke("inspect", packed, "--topic", "/rear")
+    assert f"{packed}: unpacked to " in output and f"warning: {packed}" not in output
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ from asca_pillars.base.errors import BundleError, ProviderError
 from asca_pillars.scans.scan_reader import write_scan
 from tests.deploy import conftest as tiny
 from tests.deploy.conftest import needs_openvino
-from tests.deploy.spoiled_graph import respoil
+from tests.deploy.corrupt_graph import corrupt_graph
 from tests.helpers.in_process import run_here
 
 
@@ -48,7 +48,7 @@ def take_all_memory(model: onnx.ModelProto) -> None:
 
 
 FAILURES = pytest.mark.parametrize(
-    ("graph", "spoil", "said"),
+    ("graph", "spoil", "message"),
     [
         ("encoder.onnx", read_beyond_the_end, "upgrade with `pip install --upgrade onnxruntime`, or export the bundle"),
         ("backbone.onnx", take_all_memory, "give the process more memory, or it fewer points at once"),
@@ -57,19 +57,21 @@ FAILURES = pytest.mark.parametrize(
 
 
 @FAILURES
-def test_of_a_detector_it_is_one_line(bundle_copy: Path, graph: str, spoil: object, said: str) -> None:
-    detector = Detector(respoil(bundle_copy, graph, spoil))  # type: ignore[arg-type]
+def test_of_a_detector_it_is_one_line(bundle_copy: Path, graph: str, spoil: object, message: str) -> None:
+    detector = Detector(corrupt_graph(bundle_copy, graph, spoil))  # type: ignore[arg-type]
     scan = tiny.make_scan()
     for detect in (detector, lambda points: list(detector.stream([points, points]))):
-        with pytest.raises(BundleError, match=rf"onnxruntime \S+ failed while it ran .*{graph}: .*{said}") as caught:
+        with pytest.raises(BundleError, match=rf"onnxruntime \S+ failed while it ran .*{graph}: .*{message}") as caught:
             detect(scan)
         assert str(bundle_copy) in str(caught.value)
         assert str(caught.value).isprintable() and len(str(caught.value)) < 900
 
 
 @FAILURES
-def test_of_a_command_it_is_one_line(bundle_copy: Path, tmp_path: Path, graph: str, spoil: object, said: str) -> None:
-    bundle = respoil(bundle_copy, graph, spoil)  # type: ignore[arg-type]
+def test_of_a_command_it_is_one_line(
+    bundle_copy: Path, tmp_path: Path, graph: str, spoil: object, message: str
+) -> None:
+    bundle = corrupt_graph(bundle_copy, graph, spoil)  # type: ignore[arg-type]
     scan, scans = tmp_path / "scan.bin", tmp_path / "scans"
     write_scan(scan, tiny.make_scan())
     for number in range(2):

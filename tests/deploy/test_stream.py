@@ -9,8 +9,8 @@ import pytest
 from numpy.typing import NDArray
 
 from asca_deploy import Detector
-from asca_deploy.pillar.pipeline import CanvasBackbone, PillarPipeline
-from asca_deploy.stream import overlapped
+from asca_deploy.pillar.pipeline import DenseBackbone, PillarPipeline
+from asca_deploy.stream import overlap_stages
 from asca_pillars.base.errors import ScanError
 from tests.deploy.conftest import make_scan
 from tests.helpers.same_detections import same
@@ -153,7 +153,7 @@ def test_nothing_grows_with_the_number_of_scans(tiny_bundle: Path, monkeypatch: 
     images: set[int] = set()
     assert isinstance(detector.pipeline, PillarPipeline)
     backbone = detector.pipeline.backbone
-    assert isinstance(backbone, CanvasBackbone)
+    assert isinstance(backbone, DenseBackbone)
     neck_and_head = backbone.neck_and_head
     monkeypatch.setattr(backbone, "neck_and_head", lambda image: images.add(image.ctypes.data) or neck_and_head(image))
     most_threads = 0
@@ -168,13 +168,13 @@ def test_stop_iteration_out_of_a_stage_is_an_error_and_no_end() -> None:
         raise StopIteration(scan)
 
     with pytest.raises(RuntimeError):
-        list(overlapped([1, 2], prepare, infer=lambda ready: ready, finish=lambda found: found))
+        list(overlap_stages([1, 2], prepare, infer=lambda ready: ready, finish=lambda found: found))
 
 
 LEFT = """
 import sys, threading
 from asca_deploy.scan_queue import ScanQueue
-from asca_deploy.stream import overlapped
+from asca_deploy.stream import overlap_stages
 
 def silent():
     yield 1
@@ -183,7 +183,7 @@ def silent():
 way, queue = sys.argv[1], ScanQueue("wait")
 queue.put(1)
 scans = silent() if way == "no interrupt" else queue
-stream = overlapped(scans, prepare=lambda scan: scan, infer=lambda ready: ready, finish=lambda found: found)
+stream = overlap_stages(scans, prepare=lambda scan: scan, infer=lambda ready: ready, finish=lambda found: found)
 
 def callback(found):
     if way == "raise":
@@ -195,7 +195,7 @@ print("end of program")
 
 BUSY = """
 import threading, time
-from asca_deploy.stream import overlapped
+from asca_deploy.stream import overlap_stages
 
 begun = threading.Event()
 
@@ -206,7 +206,7 @@ def infer(ready):
         print("inferred", flush=True)
     return ready
 
-stream = overlapped([1, 2], prepare=lambda scan: scan, infer=infer, finish=lambda found: found)
+stream = overlap_stages([1, 2], prepare=lambda scan: scan, infer=infer, finish=lambda found: found)
 next(stream)
 begun.wait()
 """

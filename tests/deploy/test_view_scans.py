@@ -200,8 +200,8 @@ def test_the_command_ends_on_ctrl_c_without_a_traceback(folder: Path) -> None:
     )
     try:
         assert process.stdout is not None
-        said = process.stdout.readline()
-        address = next(word for word in said.split() if word.startswith("http://127.0.0.1:"))
+        output = process.stdout.readline()
+        address = next(word for word in output.split() if word.startswith("http://127.0.0.1:"))
         with urllib.request.urlopen(address + "scans/0.json", timeout=60) as answer:
             assert len(json.load(answer)["detections"]) > 3
         process.send_signal(signal.SIGINT)

@@ -38,6 +38,6 @@ def test_suppression_that_stops_at_the_quotas_proposes_the_same() -> None:
     settings = ProposalSettings(score_threshold=0.3, candidates=200, quotas=(7, 3, 5))
     classes = tuple(replace(item, score_threshold=0.3) for item in SPEC.classes)
     everything = decode(maps, SPEC.anchors, classes, PostProcess(settings.nms_iou, 200, 600))
-    wanted, found = best_of_each_class(everything, settings.quotas), propose(maps, SPEC, settings)
+    expected, found = best_of_each_class(everything, settings.quotas), propose(maps, SPEC, settings)
     assert len(everything) > 100 and np.bincount(found.labels).tolist() == [7, 3, 5]
-    assert found.boxes.tobytes() == wanted.boxes.tobytes() and found.scores.tobytes() == wanted.scores.tobytes()
+    assert found.boxes.tobytes() == expected.boxes.tobytes() and found.scores.tobytes() == expected.scores.tobytes()

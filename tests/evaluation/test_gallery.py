@@ -8,7 +8,7 @@ import pytest
 
 from asca_pillars.data.kitti import KittiSplit, read_labels, write_labels
 from asca_pillars.data.kitti.kitti_labels import KittiObject
-from asca_pillars.evaluation.gallery import Judged, most_different_frames, worst_frames, write_gallery
+from asca_pillars.evaluation.gallery import EvaluatedDetector, most_different_frames, worst_frames, write_gallery
 from asca_pillars.evaluation.kitti.score_threshold import ScoreMatches, matches_at_score
 from asca_pillars.evaluation.predictions import read_predictions, read_truth
 from tests.helpers.gallery_cards import cards, sources, title
@@ -38,15 +38,15 @@ def root(tmp_path: Path) -> Path:
     return root
 
 
-def judge(root: Path, predictions: str = "det") -> list[ScoreMatches]:
+def match_detections(root: Path, predictions: str = "det") -> list[ScoreMatches]:
     labels = root / "training" / "label_2"
     frames = read_predictions(root.parent / predictions, read_truth(labels), labels)
     return matches_at_score(frames.truth, frames.detections, CLASSES, scores=0.3)
 
 
-def draw(root: Path, count: int, *others: Judged) -> Path:
+def draw(root: Path, count: int, *others: EvaluatedDetector) -> Path:
     folder = root.parent / "gallery"
-    own = Judged("made up", root.parent / "det", judge(root))
+    own = EvaluatedDetector("made up", root.parent / "det", match_detections(root))
     write_gallery(folder, [own, *others], count, KittiSplit(root), root / "training" / "label_2", GRID.ranges)
     return folder
 
@@ -57,7 +57,7 @@ def pixels(image: np.ndarray, color: tuple[int, int, int]) -> int:
 
 
 def test_the_worst_frames_come_first_and_flawless_ones_not_at_all(root: Path) -> None:
-    judged = judge(root)
+    judged = match_detections(root)
     assert [frame.errors for frame in judged] == [0, 4, 1, 3]
     assert [frame.frame_id for frame in worst_frames(judged, 9)] == ["000001", "000003", "000002"]
     assert [frame.frame_id for frame in worst_frames(judged, 2)] == ["000001", "000003"]
@@ -103,24 +103,24 @@ def test_objects_without_a_box_in_3d_are_not_drawn(root: Path) -> None:
     with label.open("a") as file:
         file.write("DontCare -1 -1 -10 0.00 0.00 50.00 50.00 -1 -1 -1 -1000 -1000 -1000 -10\n")
     detection.write_text("Car -1 -1 -10 100.00 100.00 200.00 200.00 -1 -1 -1 -1000 -1000 -1000 -10 0.9\n")
-    worst = worst_frames(judge(root), 1)
+    worst = worst_frames(match_detections(root), 1)
     assert (worst[0].missed.sum(), worst[0].false_positive.sum()) == (4, 1) and len(read_labels(label)) == 5
     image = np.asarray(cv2.imread(str(draw(root, 1) / "001_000001.png")))
     assert pixels(image, MAGENTA) == 0 < pixels(image, RED)
 
 
-def another(root: Path) -> Judged:
+def another(root: Path) -> EvaluatedDetector:
     """Another detector: the same; all found; one missed and one false; without predictions."""
     split, folder = KittiSplit(root), root.parent / "other"
     for frame_id in ("000000", "000001", "000002"):
         objects = scored(split.objects(frame_id))
         found = [*objects[:3], moved(objects[0])] if frame_id == "000002" else objects
         write_labels(folder / f"{frame_id}.txt", found)
-    return Judged("another", folder, judge(root, "other"))
+    return EvaluatedDetector("another", folder, match_detections(root, "other"))
 
 
 def test_two_detectors_are_compared_where_they_differ(root: Path) -> None:
-    first, second = judge(root), another(root).frames
+    first, second = match_detections(root), another(root).frames
     assert [pair[0].frame_id for pair in most_different_frames(first, second, 9)] == ["000001", "000002"]
     assert [pair[0].frame_id for pair in most_different_frames(first, second, 1)] == ["000001"]
     assert most_different_frames(first, first, 9) == []

@@ -42,13 +42,13 @@ def test_frames_are_paired_by_name_and_in_order(tmp_path: Path) -> None:
     assert [frame.frame_id for frame in frames.detections] == ["000001", "000002", "000003"]
     assert [len(frame) for frame in frames.detections] == [2, 1, 0]
     np.testing.assert_array_equal(frames.detections[0].scores, [0.5, -7.25])
-    assert frames.shortage is None and frames.asked == len(frames) == 3
+    assert frames.shortage is None and frames.requested == len(frames) == 3
 
 
 def test_frames_without_a_prediction_file_are_left_out_and_named(tmp_path: Path) -> None:
     frames = score(tmp_path, {"000002": f"{CAR} 0.5"})
     assert [frame.frame_id for frame in frames.truth] == ["000002"]
-    assert frames.without_predictions == ("000001", "000003") and frames.asked == 3
+    assert frames.without_predictions == ("000001", "000003") and frames.requested == 3
     assert frames.shortage == (
         "evaluated on 1 of 3 frames: no prediction file for 000001 and 1 other; "
         "a frame without detections needs an empty file"

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
+from asca_export.bundle_writer import ExportOptions
 from asca_export.pillar.export import export_pillar_bundle
-from asca_export.proven_bundle import ExportOptions
 from asca_pillars.config.pillar import CpaReading
 from tests.export.tiny import SCANS, tiny_checkpoint
 from tests.helpers.made_once import made_once

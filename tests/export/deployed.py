@@ -34,9 +34,9 @@ def assert_same_detector(checkpoint: Checkpoint, folder: Path, tmp_path: Path) -
     found = [in_onnx(scan) for scan in SCANS]
     assert sum(map(len, found)) > 0
     for scan, detections in zip(SCANS, found, strict=True):
-        wanted = in_torch(scan)
-        np.testing.assert_allclose(detections.boxes, wanted.boxes, atol=1e-2)
-        np.testing.assert_allclose(detections.scores, wanted.scores, atol=1e-3)
+        expected = in_torch(scan)
+        np.testing.assert_allclose(detections.boxes, expected.boxes, atol=1e-2)
+        np.testing.assert_allclose(detections.scores, expected.scores, atol=1e-3)
     assert set(found[0].report.times_ms) == {"input", *in_onnx.pipeline.stages}
     for streamed, alone in zip(in_onnx.stream(SCANS), found, strict=True):
         np.testing.assert_array_equal(streamed.boxes, alone.boxes)

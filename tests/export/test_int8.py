@@ -14,10 +14,10 @@ from onnx import numpy_helper
 from asca_deploy import Detector
 from asca_deploy.bundle import PillarBundle
 from asca_deploy.manifest import load_pillar_bundle
-from asca_deploy.pillar.pipeline import CanvasBackbone, PillarPipeline
+from asca_deploy.pillar.pipeline import DenseBackbone, PillarPipeline
 from asca_export import graphs, int8
+from asca_export.bundle_writer import ExportOptions
 from asca_export.pillar.export import export_pillar_bundle
-from asca_export.proven_bundle import ExportOptions
 from asca_pillars.base.errors import ExportError
 from asca_pillars.config.pillar import CpaReading
 from asca_pillars.config.tree import pillar_spec
@@ -84,7 +84,7 @@ def test_onnxruntime_computes_what_the_graph_says(folder: Path) -> None:
     detector = Detector(folder)
     assert isinstance(detector.pipeline, PillarPipeline)
     backbone = detector.pipeline.backbone
-    assert isinstance(backbone, CanvasBackbone)
+    assert isinstance(backbone, DenseBackbone)
     options = onnxruntime.SessionOptions()
     options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_DISABLE_ALL
     plain = onnxruntime.InferenceSession(folder / "backbone.onnx", options, providers=["CPUExecutionProvider"])

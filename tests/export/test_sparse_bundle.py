@@ -14,8 +14,8 @@ from asca_deploy.bundle import CanvasFormat, PillarSection
 from asca_deploy.golden import golden_stages
 from asca_deploy.manifest import load_pillar_bundle
 from asca_deploy.pillar.pipeline import PillarPipeline, open_backbone
+from asca_export.bundle_writer import ExportOptions
 from asca_export.pillar.export import export_pillar_bundle
-from asca_export.proven_bundle import ExportOptions
 from asca_pillars.base.errors import ConfigError, ProviderError
 from asca_pillars.config.pillar import PillarModel
 from asca_pillars.models.checkpoint import Checkpoint

@@ -63,7 +63,7 @@ def sample_of(detector: PillarDetector, pillars: Pillars) -> SparseSample:
 
 def quantized_backbone(detector: PillarDetector, samples: Sequence[SparseSample], steps: CanvasSteps) -> SparseBackbone:
     """Every row in steps and every weight on the grid of 8-bit arithmetic, from real values of scans with pillars."""
-    backbone, counted = SparseBackbone(detector, steps), [sample.in_steps(steps) for sample in samples]
+    backbone, counted = SparseBackbone(detector, steps), [sample.quantize_features(steps) for sample in samples]
     scale_rows_to_steps(backbone, counted)
     round_products(backbone, list(backbone.products), read_moments(backbone, counted))
     return backbone
@@ -73,13 +73,13 @@ class OpenGraph:
     def __init__(self, path: Path, threads: int) -> None:
         self.session = OrtSession(path, "cpu", "float32", threads)
 
-    def run(self, features: np.ndarray, tables: NeckRulebooks[np.ndarray]) -> HeadMaps[np.ndarray]:
-        given = {PILLAR_FEATURES: features, **rulebook_inputs(tables)}
+    def run(self, features: np.ndarray, rulebooks: NeckRulebooks[np.ndarray]) -> HeadMaps[np.ndarray]:
+        given = {PILLAR_FEATURES: features, **rulebook_inputs(rulebooks)}
         return HeadMaps(*self.session.run(HeadMaps._fields, {name: given[name] for name in self.session.inputs}))
 
 
-def arrays(tables: NeckRulebooks[torch.Tensor]) -> NeckRulebooks[np.ndarray]:
-    return tree_map_only(torch.Tensor, lambda tensor: tensor.numpy(), tables)
+def arrays(rulebooks: NeckRulebooks[torch.Tensor]) -> NeckRulebooks[np.ndarray]:
+    return tree_map_only(torch.Tensor, lambda tensor: tensor.numpy(), rulebooks)
 
 
 def assert_same_bits(runs: Sequence[HeadMaps[np.ndarray]]) -> None:
@@ -103,19 +103,19 @@ def test_the_graph_is_the_network_and_the_same_for_any_number_of_threads(rule: M
         sample = sample_of(detector, pillars)
         with torch.inference_mode():
             expected = detector.head.at_cells(detector.neck(*sample))
-        features, tables = sample.features.numpy(), arrays(sample.tables)
-        for want, found in zip(expected, graphs[1].run(features, tables), strict=True):
+        features, rulebooks = sample.features.numpy(), arrays(sample.rulebooks)
+        for want, found in zip(expected, graphs[1].run(features, rulebooks), strict=True):
             np.testing.assert_allclose(found, want.numpy(), atol=1e-4)
-        assert_same_bits([graph.run(features, tables) for graph in graphs.values() for _ in range(20)])
+        assert_same_bits([graph.run(features, rulebooks) for graph in graphs.values() for _ in range(20)])
 
 
 def test_a_scan_with_a_single_pillar(tmp_path: Path) -> None:
     detector = sparse_detector("fine")
     export_sparse_backbone(SparseBackbone(detector), tmp_path / "backbone.onnx")
     graph = OpenGraph(tmp_path / "backbone.onnx", 1)
-    tables = NeckRulebookBuilder(SPEC.grid.ny, SPEC.grid.nx, "fine").build(np.array([37]))
-    one = graph.run(np.ones((1, NETWORK.pillar_channels), np.float32), tables)
-    assert one.scores.shape == (len(tables.head_cells), 6) and np.isfinite(one.scores).all()
+    rulebooks = NeckRulebookBuilder(SPEC.grid.ny, SPEC.grid.nx, "fine").build(np.array([37]))
+    one = graph.run(np.ones((1, NETWORK.pillar_channels), np.float32), rulebooks)
+    assert one.scores.shape == (len(rulebooks.head_cells), 6) and np.isfinite(one.scores).all()
 
 
 def test_eight_bits_are_near_and_the_same_for_any_number_of_threads(tmp_path: Path) -> None:
@@ -123,7 +123,7 @@ def test_eight_bits_are_near_and_the_same_for_any_number_of_threads(tmp_path: Pa
     samples = [sample_of(detector, SPEC.pillarize(points)) for points in SCANS]
     steps = canvas_steps(sample.features.numpy() for sample in samples)
     backbone = SparseBackbone(detector, steps)
-    counted = [sample.in_steps(steps) for sample in samples]
+    counted = [sample.quantize_features(steps) for sample in samples]
     scale_rows_to_steps(backbone, counted)
     with torch.inference_mode():  # scaled, it is still the same function
         exact = SparseBackbone(detector)(*samples[0]).scores
@@ -133,7 +133,7 @@ def test_eight_bits_are_near_and_the_same_for_any_number_of_threads(tmp_path: Pa
     graphs = {threads: OpenGraph(tmp_path / "int8.onnx", threads) for threads in (1, 2, 4)}
     for sample in samples[:2]:
         whole = (sample.features / steps.scale + steps.empty).round().clamp(0, STEPS).numpy().astype(np.uint8)
-        runs = [graph.run(whole, arrays(sample.tables)) for graph in graphs.values() for _ in range(20)]
+        runs = [graph.run(whole, arrays(sample.rulebooks)) for graph in graphs.values() for _ in range(20)]
         assert_same_bits(runs)
         with torch.inference_mode():
             expected = SparseBackbone(detector)(*sample)

@@ -28,8 +28,8 @@ def make_tables(
         target = source
     else:
         target.activate_joined([(source, convolution.outputs(source.shape, target.shape))])
-    table = target.table(source, convolution.inputs(target.shape, source.shape))
-    back = source.table(target, convolution.outputs(source.shape, target.shape))
+    table = target.rulebook(source, convolution.inputs(target.shape, source.shape))
+    back = source.rulebook(target, convolution.outputs(source.shape, target.shape))
     return source, target, (torch.from_numpy(table), torch.from_numpy(back))
 
 

@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 
 from asca_pillars.geometry.overlap import bev_iou
 from asca_pillars.ops.pillar.grid import PillarGrid
-from asca_pillars.ops.pillar.prepare import FEATURES, evenly
+from asca_pillars.ops.pillar.prepare import FEATURES, evenly_spaced_mask
 from asca_pillars.ops.points.sampling import Columns, cells_of
 from asca_pillars.ops.pv_rcnn.voxels import VoxelGrid, Voxels
-from asca_pillars.ops.sparse.rulebooks import CellMap, Links, Shape
+from asca_pillars.ops.sparse.rulebooks import AxisKernelMaps, CellMap, Shape
 
 _NEAREST = 3
 _PAIRS_AT_ONCE = _DISTANCES_AT_ONCE = 1 << 22
@@ -79,7 +79,7 @@ def _fill_pillars(
     pillar_of_point = np.repeat(np.arange(len(cells)), counts)
     stays = kept[pillar_of_point]
     starts = np.cumsum(counts) - counts
-    stays &= evenly(np.arange(len(order)) - starts[pillar_of_point], counts[pillar_of_point], max_points)
+    stays &= evenly_spaced_mask(np.arange(len(order)) - starts[pillar_of_point], counts[pillar_of_point], max_points)
 
     point_counts = np.minimum(counts[kept], max_points)
     features = _features(points.take(order[stays], axis=0), point_counts, grid.cell_centers_m(cells[kept]))
@@ -261,13 +261,17 @@ class NumpyCellMap(CellMap):
         self.cells = cells
 
     def activate_joined(self, sources: Any) -> None:
-        joined = [cells[joins] for source, links in sources for cells, joins in _taps(source.cells, links, self.shape)]
+        joined = [
+            cells[joins]
+            for source, kernel_maps in sources
+            for cells, joins in _taps(source.cells, kernel_maps, self.shape)
+        ]
         self.cells = np.unique(np.concatenate(joined))
 
-    def table(self, source: CellMap, links: Links) -> NDArray[np.int32]:
+    def rulebook(self, source: CellMap, kernel_maps: AxisKernelMaps) -> NDArray[np.int32]:
         taps = [
             np.where(joins, _rows(source.cells, cells), len(source))
-            for cells, joins in _taps(self.cells, links, source.shape)
+            for cells, joins in _taps(self.cells, kernel_maps, source.shape)
         ]
         return np.stack(taps, axis=1).astype(np.int32)
 
@@ -280,23 +284,23 @@ class NumpyCellMap(CellMap):
 
 
 def _taps(
-    cells: NDArray[np.int64], links: Links, other: Shape
+    cells: NDArray[np.int64], kernel_maps: AxisKernelMaps, other: Shape
 ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.bool_]]]:
     """Tap by tap: the cells of `other` that it joins with `cells`, and whether it joins them with any; (N,) both."""
-    yx, z = np.divmod(cells, len(links.z))
-    y, x = np.divmod(yx, len(links.x))
-    for z_tap, y_tap, x_tap in product(links.z.T, links.y.T, links.x.T):
+    yx, z = np.divmod(cells, len(kernel_maps.z))
+    y, x = np.divmod(yx, len(kernel_maps.x))
+    for z_tap, y_tap, x_tap in product(kernel_maps.z.T, kernel_maps.y.T, kernel_maps.x.T):
         other_z, other_y, other_x = z_tap[z], y_tap[y], x_tap[x]
         joins = (other_z >= 0) & (other_y >= 0) & (other_x >= 0)
         yield (other_y * other[2] + other_x) * other[0] + other_z, joins
 
 
-def _rows(sorted_cells: NDArray[np.int64], wanted: NDArray[np.int64]) -> NDArray[np.int64]:
+def _rows(sorted_cells: NDArray[np.int64], expected: NDArray[np.int64]) -> NDArray[np.int64]:
     """Where each wanted cell stands among the sorted ones, len(sorted_cells) if it does not."""
     if not len(sorted_cells):
-        return np.zeros(len(wanted), np.int64)
-    rows = np.searchsorted(sorted_cells, wanted)
-    found = sorted_cells[np.minimum(rows, len(sorted_cells) - 1)] == wanted
+        return np.zeros(len(expected), np.int64)
+    rows = np.searchsorted(sorted_cells, expected)
+    found = sorted_cells[np.minimum(rows, len(sorted_cells) - 1)] == expected
     return np.where(found, rows, len(sorted_cells))
 
 

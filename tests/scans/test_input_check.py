@@ -216,10 +216,10 @@ def test_a_camera_view_crop_is_no_surprise_after_full_scans() -> None:
 AHEAD = Ranges((0.0, 69.12), (-30.72, 30.72), (-3.0, 1.0))
 
 
-def told_to_look_around(points: Points, looks_in: Ranges | None = AHEAD, axes: str = "x-forward") -> bool:
+def told_to_look_around(points: Points, model_ranges: Ranges | None = AHEAD, axes: str = "x-forward") -> bool:
     points = Mounting(axes=axes).level.inverse.points(points)
     counts = pillarize(points, GRID, PillarLimits()).stats
-    texts = {warning.about: warning.text for warning in check_input(points, counts, EXPECTED, None, looks_in)}
+    texts = {warning.about: warning.text for warning in check_input(points, counts, EXPECTED, None, model_ranges)}
     assert "view" not in texts or "(--around)" in texts["view"]
     return "view" in texts
 

@@ -25,7 +25,7 @@ def test_times_of_a_file_are_its_seconds(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         ("0\n0.1\n", r"times\.txt: 2 times for 3 scans"),
         ("0\n0.2\n0.1\n", r"times\.txt:3: 0\.1 is not after"),
@@ -35,16 +35,16 @@ def test_times_of_a_file_are_its_seconds(tmp_path: Path) -> None:
         ("time\n0\n0.1\n", r"times\.txt:1: 'time' is no time"),
     ],
 )
-def test_files_that_list_no_times_are_refused(tmp_path: Path, text: str, said: str) -> None:
+def test_files_that_list_no_times_are_refused(tmp_path: Path, text: str, message: str) -> None:
     (tmp_path / "times.txt").write_text(text)
-    with pytest.raises(ScanError, match=said):
+    with pytest.raises(ScanError, match=message):
         scan_times_ns(3, times=tmp_path / "times.txt")
 
 
 def test_what_is_no_text_is_refused(tmp_path: Path) -> None:
     (tmp_path / "times.txt").write_bytes(b"\xff\xfe0")
-    for path, said in ((tmp_path / "times.txt", "is no text"), (tmp_path / "none.txt", "none.txt: ")):
-        with pytest.raises(ScanError, match=said):
+    for path, message in ((tmp_path / "times.txt", "is no text"), (tmp_path / "none.txt", "none.txt: ")):
+        with pytest.raises(ScanError, match=message):
             scan_times_ns(3, times=path)
 
 

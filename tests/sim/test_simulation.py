@@ -52,7 +52,7 @@ def test_a_cluster_writes_the_same_bytes(tmp_path: Path, monkeypatch: pytest.Mon
             handed_out.append(item)
 
     simulate(tmp_path / "one", 4, seed=3, config=CAMERA, progress=False)
-    monkeypatch.setattr("asca_pillars.sim.simulation.run_each", run_here)
+    monkeypatch.setattr("asca_pillars.sim.simulation.run_items", run_here)
     simulate(tmp_path / "two", 2, seed=3, config=CAMERA, progress=False, cluster="made-up:1")
     simulate(tmp_path / "two", 4, seed=3, config=CAMERA, progress=False, cluster="made-up:1")
     assert handed_out == [1, 0, 3, 2], "frames that are there are left out"

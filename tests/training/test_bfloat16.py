@@ -9,7 +9,7 @@ import torch
 from asca_pillars.config.tree import Precision, load_config
 from asca_pillars.training import module as bfloat16
 from asca_pillars.training.loop import train
-from asca_pillars.training.module import has_bfloat16, settled
+from asca_pillars.training.module import has_bfloat16, resolve_precision
 from tests.helpers.scenes import write_dataset
 from tests.helpers.shipped_configs import CONFIGS
 from tests.helpers.tiny_run import CONFIG
@@ -22,9 +22,9 @@ def test_auto_follows_the_device(
     precision: Precision, with_it: Precision, without: Precision, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(bfloat16, "has_bfloat16", lambda device: True)
-    assert settled(precision) == with_it
+    assert resolve_precision(precision) == with_it
     monkeypatch.setattr(bfloat16, "has_bfloat16", lambda device: False)
-    assert settled(precision) == without
+    assert resolve_precision(precision) == without
 
 
 def test_a_gpu_answers_for_itself(monkeypatch: pytest.MonkeyPatch) -> None:

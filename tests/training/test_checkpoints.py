@@ -19,7 +19,7 @@ from asca_pillars.models.checkpoint_file import save_weights
 from asca_pillars.training import loop
 from asca_pillars.training.checkpoints import AtomicCheckpointIO, BestCheckpoint, checkpoint_to_resume
 from asca_pillars.training.loop import train
-from asca_pillars.training.run_folder import Seen, claim, measure_input
+from asca_pillars.training.run_folder import TrainingInputs, claim_run_folder, measure_input
 from tests.helpers.scenes import write_dataset
 from tests.helpers.tiny_run import CONFIG
 
@@ -188,50 +188,50 @@ def test_of_hidden_files_only_those_of_a_killed_run_go(tmp_path: Path) -> None:
     assert (folder / ".ipynb_checkpoints" / "notes.ipynb").exists()
 
 
-SEEN = Seen(2, "ab", 1)
+SEEN = TrainingInputs(2, "ab", 1)
 
 
 def test_a_run_is_the_same_with_other_workers_folders_and_intervals(tmp_path: Path) -> None:
-    claim(tmp_path, CONFIG, SEEN)
+    claim_run_folder(tmp_path, CONFIG, SEEN)
     data = DataConfig(workers=7, prepared=str(tmp_path))
     recipe = dataclasses.replace(CONFIG.train, checkpoint_steps=9)
-    claim(tmp_path, dataclasses.replace(CONFIG, data=data, train=recipe), SEEN)
+    claim_run_folder(tmp_path, dataclasses.replace(CONFIG, data=data, train=recipe), SEEN)
     learn(tmp_path)
     with pytest.raises(TrainingError, match=r"data\.min_points = 1, now data\.min_points = 2"):
-        claim(tmp_path, dataclasses.replace(CONFIG, data=DataConfig(min_points=2)), SEEN)
+        claim_run_folder(tmp_path, dataclasses.replace(CONFIG, data=DataConfig(min_points=2)), SEEN)
 
 
 def test_a_run_goes_on_with_its_own_frames_and_processes_alone(tmp_path: Path) -> None:
-    claim(tmp_path, CONFIG, SEEN)
-    claim(tmp_path, CONFIG, Seen(2, "ac", 1))  # nothing is learnt yet
+    claim_run_folder(tmp_path, CONFIG, SEEN)
+    claim_run_folder(tmp_path, CONFIG, TrainingInputs(2, "ac", 1))  # nothing is learnt yet
     learn(tmp_path)
-    claim(tmp_path, CONFIG, Seen(2, "ac", 1))
+    claim_run_folder(tmp_path, CONFIG, TrainingInputs(2, "ac", 1))
     with pytest.raises(TrainingError, match=r"frames\.json: .* on 2 frames, now there are 3, or others; give"):
-        claim(tmp_path, CONFIG, Seen(3, "abc", 1))
+        claim_run_folder(tmp_path, CONFIG, TrainingInputs(3, "abc", 1))
     with pytest.raises(TrainingError, match=r"started with 1 process\(es\), now 2: .* give as many --devices"):
-        claim(tmp_path, CONFIG, Seen(2, "ac", 2))
+        claim_run_folder(tmp_path, CONFIG, TrainingInputs(2, "ac", 2))
     (tmp_path / "frames.json").write_text("{")
     with pytest.raises(ConfigError, match=r"frames\.json: not valid YAML"):
-        claim(tmp_path, CONFIG, SEEN)
+        claim_run_folder(tmp_path, CONFIG, SEEN)
     (tmp_path / "frames.json").unlink()  # an older version wrote none
-    claim(tmp_path, CONFIG, SEEN)
+    claim_run_folder(tmp_path, CONFIG, SEEN)
 
 
 def test_a_run_may_be_made_longer_where_its_schedule_allows(tmp_path: Path) -> None:
     def of(**recipe: object) -> Config:
         return dataclasses.replace(CONFIG, train=TrainConfig(**recipe))  # type: ignore[arg-type]
 
-    claim(tmp_path / "step", of(epochs=2, schedule="step"), SEEN)
+    claim_run_folder(tmp_path / "step", of(epochs=2, schedule="step"), SEEN)
     learn(tmp_path / "step")
-    claim(tmp_path / "step", of(epochs=5, schedule="step"), SEEN)
+    claim_run_folder(tmp_path / "step", of(epochs=5, schedule="step"), SEEN)
     with pytest.raises(TrainingError, match=r"train\.epochs = 5, now train\.epochs = 4; choose another"):
-        claim(tmp_path / "step", of(epochs=4, schedule="step"), SEEN)
+        claim_run_folder(tmp_path / "step", of(epochs=4, schedule="step"), SEEN)
     with pytest.raises(TrainingError, match=r"train\.seed = 0, now train\.seed = 1"):
-        claim(tmp_path / "step", of(epochs=9, schedule="step", seed=1), SEEN)
-    claim(tmp_path / "cycle", of(epochs=2, schedule="one_cycle"), SEEN)
+        claim_run_folder(tmp_path / "step", of(epochs=9, schedule="step", seed=1), SEEN)
+    claim_run_folder(tmp_path / "cycle", of(epochs=2, schedule="one_cycle"), SEEN)
     learn(tmp_path / "cycle")
     with pytest.raises(TrainingError, match=r"one_cycle schedule is planned .*--init .*last\.ckpt"):
-        claim(tmp_path / "cycle", of(epochs=3, schedule="one_cycle"), SEEN)
+        claim_run_folder(tmp_path / "cycle", of(epochs=3, schedule="one_cycle"), SEEN)
 
 
 def test_a_stable_run_may_be_made_longer_until_its_rate_falls(tmp_path: Path) -> None:
@@ -239,20 +239,20 @@ def test_a_stable_run_may_be_made_longer_until_its_rate_falls(tmp_path: Path) ->
         recipe = TrainConfig(epochs=epochs, batch_size=1, schedule="warmup_stable_decay", cooldown=0.25)
         return dataclasses.replace(CONFIG, train=recipe)
 
-    seen = Seen(10, "ab", 1)  # ten steps an epoch: of four epochs the last ten steps fall
-    claim(tmp_path, of(4), seen)
+    seen = TrainingInputs(10, "ab", 1)  # ten steps an epoch: of four epochs the last ten steps fall
+    claim_run_folder(tmp_path, of(4), seen)
     learn(tmp_path)
     with pytest.raises(TrainingError, match=r"fallen since step 30 of 40: start .*--init .*last\.ckpt"):
-        claim(tmp_path, of(8), seen, steps=31)
-    claim(tmp_path, of(8), seen, steps=30)
+        claim_run_folder(tmp_path, of(8), seen, steps=31)
+    claim_run_folder(tmp_path, of(8), seen, steps=30)
 
 
 def test_a_run_that_learnt_nothing_gives_way(tmp_path: Path) -> None:
     """The corrected command may be given again, and nothing of the mistaken one stays."""
-    claim(tmp_path, CONFIG, SEEN)
+    claim_run_folder(tmp_path, CONFIG, SEEN)
     (tmp_path / "environment.json").write_text("of the mistaken run")
     other = dataclasses.replace(CONFIG, data=DataConfig(min_points=2))
-    claim(tmp_path, other, SEEN)
+    claim_run_folder(tmp_path, other, SEEN)
     assert yaml.safe_load((tmp_path / "config.yaml").read_text()) == to_dict(other)
     assert "torch" in (tmp_path / "environment.json").read_text()
 

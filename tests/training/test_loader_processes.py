@@ -5,7 +5,7 @@ import signal
 import sys
 from multiprocessing.connection import Connection
 
-from asca_pillars.training.shared_batches import leave_interrupts_to_the_loop, loader_context
+from asca_pillars.training.shared_batches import ignore_interrupts, loader_context
 
 
 def tell(connection: Connection) -> None:
@@ -24,7 +24,7 @@ def test_a_process_starts_with_what_it_needs_and_without_the_loop() -> None:
 
 
 def answer(connection: Connection) -> None:
-    leave_interrupts_to_the_loop()
+    ignore_interrupts()
     connection.send("ready")
     while connection.recv() is None:
         connection.send("still here")

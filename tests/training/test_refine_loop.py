@@ -21,7 +21,7 @@ from asca_pillars.models.scan_detector import ScanDetector
 from asca_pillars.models.two_stage.first_stage import open_first_stage, with_first_stage
 from asca_pillars.models.two_stage.network import RefineDetector, refine
 from asca_pillars.models.two_stage.preparation import LabeledProposals, move_proposed
-from asca_pillars.ops.two_stage.first_stage import propose_on
+from asca_pillars.ops.two_stage.first_stage import run_first_stage
 from asca_pillars.ops.two_stage.rois import match_proposals
 from asca_pillars.training.dataset import Batch, Collate, open_dataset
 from asca_pillars.training.loop import train
@@ -63,7 +63,7 @@ def test_a_checkpoint_runs_both_stages(tmp_path: Path, stage: Path) -> None:
     assert isinstance(model, RefineModel) and isinstance(detector, RefineDetector)
     points = KittiSplit(data, "val").points("000002", camera_view=True)
     found = ScanDetector(detector, model.spec.with_score_threshold(0.0))(points)
-    proposed = propose_on(open_first_stage(str(stage)), points, model.refine.seen)
+    proposed = run_first_stage(open_first_stage(str(stage)), points, model.refine.seen)
     wanted = refine(detector.refiner, points, proposed, model.refine.neighbors, model.spec.post, model.refine.scores)
     assert len(found) > 0
     np.testing.assert_array_equal(found.boxes, wanted.boxes)
@@ -137,7 +137,7 @@ def test_ignored_proposals_are_detected_and_not_learnt(tmp_path: Path, stage: Pa
     with torch.inference_mode():
         outputs = detector.predict(batch.inputs)
     assert isinstance(batch.inputs, LabeledProposals)
-    batch.inputs.learnt[:] = False
+    batch.inputs.loss_mask[:] = False
     assert detector.loss(outputs, batch.inputs)["confidence"] == 0
     assert len(detector.detect(outputs, SPEC.with_score_threshold(0.0))[0]) > 0
 

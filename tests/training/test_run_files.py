@@ -11,7 +11,7 @@ from asca_pillars.base.schema import to_dict
 from asca_pillars.base.system import describe_environment
 from asca_pillars.config.tree import Config
 from asca_pillars.training.run_files import YAML_HEAD, require_own_run
-from asca_pillars.training.run_folder import Seen, claim
+from asca_pillars.training.run_folder import TrainingInputs, claim_run_folder
 from tests.helpers.in_process import run_here
 from tests.helpers.tiny_run import CONFIG
 
@@ -36,7 +36,7 @@ def test_a_configuration_of_the_user_is_not_replaced(tmp_path: Path, content: st
 
 
 def test_nor_is_one_that_is_put_into_the_folder_of_a_run(tmp_path: Path) -> None:
-    claim(tmp_path, CONFIG, Seen(0, "", 1))
+    claim_run_folder(tmp_path, CONFIG, TrainingInputs(0, "", 1))
     require_own_run(tmp_path)
     for name in ("config.yaml", "expected_input.yaml", "environment.json", "frames.json"):
         before = (tmp_path / name).read_text() if (tmp_path / name).exists() else None
@@ -46,7 +46,7 @@ def test_nor_is_one_that_is_put_into_the_folder_of_a_run(tmp_path: Path) -> None
         (tmp_path / name).unlink() if before is None else (tmp_path / name).write_text(before)
     (tmp_path / "config.yaml").write_text(USERS["commented"])
     with pytest.raises(OutputError, match=r"config\.yaml: `asca train` did not write it"):
-        claim(tmp_path, CONFIG, Seen(0, "", 1))  # from Python
+        claim_run_folder(tmp_path, CONFIG, TrainingInputs(0, "", 1))  # from Python
 
 
 def test_the_folder_of_an_older_version_s_run_is_one(tmp_path: Path) -> None:
@@ -62,7 +62,7 @@ def test_the_folder_of_an_older_version_s_run_is_one(tmp_path: Path) -> None:
 
 
 def test_what_a_run_writes_says_so(tmp_path: Path) -> None:
-    claim(tmp_path, CONFIG, Seen(0, "", 1))
+    claim_run_folder(tmp_path, CONFIG, TrainingInputs(0, "", 1))
     text = (tmp_path / "config.yaml").read_text()
     assert text.startswith(YAML_HEAD) and yaml.safe_load(text) == to_dict(CONFIG)
 
@@ -70,7 +70,7 @@ def test_what_a_run_writes_says_so(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", ["checkpoints", "tensorboard", "config.yaml"])
 def test_nothing_is_trained_through_links(tmp_path: Path, name: str) -> None:
     run, elsewhere = tmp_path / "run", tmp_path / "elsewhere"
-    claim(run, CONFIG, Seen(0, "", 1))
+    claim_run_folder(run, CONFIG, TrainingInputs(0, "", 1))
     elsewhere.mkdir()
     (run / name).unlink(missing_ok=True)
     (run / name).symlink_to(elsewhere)
@@ -79,7 +79,7 @@ def test_nothing_is_trained_through_links(tmp_path: Path, name: str) -> None:
 
 
 def test_weights_to_start_from_are_not_those_that_the_run_replaces(tmp_path: Path) -> None:
-    claim(tmp_path / "run", CONFIG, Seen(0, "", 1))
+    claim_run_folder(tmp_path / "run", CONFIG, TrainingInputs(0, "", 1))
     best = tmp_path / "run" / "checkpoints" / "best.ckpt"
     best.parent.mkdir()
     best.touch()
@@ -93,7 +93,7 @@ def test_the_output_of_a_shell_stays_beside_a_run(tmp_path: Path) -> None:
     """`asca train ... > run/train.log`, which the shell opens first."""
     (tmp_path / "train.log").touch()
     require_own_run(tmp_path)
-    claim(tmp_path, CONFIG, Seen(0, "", 1))
+    claim_run_folder(tmp_path, CONFIG, TrainingInputs(0, "", 1))
     (tmp_path / "train.log").write_text("Epoch 1\n")
     require_own_run(tmp_path)
     (tmp_path / "config.yaml").unlink()

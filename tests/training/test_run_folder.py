@@ -11,14 +11,14 @@ from asca_pillars.base.schema import to_dict
 from asca_pillars.data.kitti import KittiSplit
 from asca_pillars.models.checkpoint import load_checkpoint
 from asca_pillars.training.loop import train
-from asca_pillars.training.run_folder import Seen, claim
+from asca_pillars.training.run_folder import TrainingInputs, claim_run_folder
 from tests.helpers.scenes import write_dataset
 from tests.helpers.tiny_run import CONFIG, with_train
 
 
 def test_another_config_does_not_enter_a_run(tmp_path: Path) -> None:
     data = write_dataset(tmp_path / "data", 3)
-    claim(tmp_path / "run", CONFIG, Seen(0, "", 1))
+    claim_run_folder(tmp_path / "run", CONFIG, TrainingInputs(0, "", 1))
     (tmp_path / "run" / "checkpoints").mkdir()
     (tmp_path / "run" / "checkpoints" / "best.ckpt").touch()
     with pytest.raises(TrainingError, match=r"config\.yaml: .* train\.seed = 0, now train\.seed = 1; choose another"):
@@ -29,7 +29,7 @@ def test_a_folder_in_which_another_process_trains_is_left_to_it(tmp_path: Path) 
     """Before its first checkpoint, too, when its files could be taken for those of a run that never began."""
     data = write_dataset(tmp_path / "data", 3)
     with only_writer(tmp_path / "run", "asca train"):
-        claim(tmp_path / "run", CONFIG, Seen(0, "", 1))
+        claim_run_folder(tmp_path / "run", CONFIG, TrainingInputs(0, "", 1))
         with pytest.raises(OutputError, match=r"run: another `asca train` is at work there; let it end"):
             train(with_train(seed=1), data, tmp_path / "run")
         assert yaml.safe_load((tmp_path / "run" / "config.yaml").read_text()) == to_dict(CONFIG)

@@ -13,9 +13,9 @@ from rich.progress import track
 from asca_pillars.base.errors import DatasetError
 from asca_pillars.data.boxes.box_records import can_be_written, records_from
 from asca_pillars.data.boxes.box_split import BoxDataset
-from asca_pillars.data.importing.foreign_values import LeftOut, text_of
+from asca_pillars.data.importing.foreign_values import SkippedEntries, text_of
 from asca_pillars.data.importing.imported import Imported, ImportedFrame
-from asca_pillars.geometry.rotations import of_quaternions
+from asca_pillars.geometry.rotations import rotations_from_quaternions
 from asca_pillars.scans.feather import feather_table
 from asca_pillars.scans.find_scans import files_below
 
@@ -39,7 +39,7 @@ def read_argoverse2(root: Path) -> Imported:
     logs = sorted(path.parent for path in files_below(root) if path.name == "annotations.feather")
     if not logs:
         raise DatasetError(f"{root}: no annotations.feather below; give a folder of Argoverse 2 logs")
-    left_out = LeftOut()
+    left_out = SkippedEntries()
     frames = [frame for log in track(logs, "Reading logs", transient=True) for frame in _frames(log, left_out)]
     settings = BoxDataset(
         sensor_height=AXLE_HEIGHT_M, reflectance_scale=255.0, scans=str(root), sensor_position=SENSOR_POSITION_M
@@ -47,7 +47,7 @@ def read_argoverse2(root: Path) -> Imported:
     return Imported(settings, frames, left_out)
 
 
-def _frames(log: Path, left_out: LeftOut) -> list[ImportedFrame]:
+def _frames(log: Path, left_out: SkippedEntries) -> list[ImportedFrame]:
     path = log / "annotations.feather"
     numbers = ("timestamp_ns", *_CENTER, *_SIZE, *_TURN)
     table = feather_table(path, numbers, ("track_uuid", "category"), DatasetError)
@@ -55,7 +55,7 @@ def _frames(log: Path, left_out: LeftOut) -> list[ImportedFrame]:
     if stamps.dtype.kind not in "iu":
         raise DatasetError(f"{path}: column `timestamp_ns` has no whole numbers; copy the file again")
     with np.errstate(invalid="ignore", over="ignore"):
-        turns = of_quaternions(np.column_stack([table[name] for name in _TURN]).astype(np.float64))
+        turns = rotations_from_quaternions(np.column_stack([table[name] for name in _TURN]).astype(np.float64))
         yaw = np.arctan2(turns[:, 1, 0], turns[:, 0, 0])
         boxes = np.column_stack([*(table[name] for name in (*_CENTER, *_SIZE)), yaw]).astype(np.float64)
         can = can_be_written(boxes)

@@ -4,7 +4,7 @@ from pathlib import Path
 
 from asca_pillars.base.schema import parse, to_dict
 from asca_pillars.data.boxes.box_split import BoxDataset, find_frames
-from asca_pillars.data.importing.foreign_values import LeftOut
+from asca_pillars.data.importing.foreign_values import SkippedEntries
 from asca_pillars.data.importing.imported import Imported, ImportedFrame
 from asca_pillars.scans.scan_settings import ScanSettings
 
@@ -29,7 +29,7 @@ def read_box_files(labels: Path, scans: Path, settings: ScanSettings) -> Importe
         ImportedFrame(frame.scan, frame.records, frame.scan.parent.relative_to(scans).as_posix(), frame.time_s)
         for frame in find_frames(labels, scans).values()
     ]
-    return Imported(dataset, frames, LeftOut())
+    return Imported(dataset, frames, SkippedEntries())
 
 
 def dataset_settings(scans: Path, settings: ScanSettings) -> BoxDataset:

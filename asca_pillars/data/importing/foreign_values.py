@@ -13,7 +13,7 @@ _QUOTE = reprlib.Repr()
 _QUOTE.maxstring = _QUOTE.maxother = _QUOTE.maxlong = 60
 
 
-class LeftOut:
+class SkippedEntries:
     """Counts of unusable data by kind, with the reason for the first of each kind."""
 
     def __init__(self) -> None:

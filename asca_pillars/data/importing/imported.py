@@ -17,7 +17,7 @@ from asca_pillars.base.own_files import json_lines, require_own, require_own_fil
 from asca_pillars.base.schema import parse, to_dict
 from asca_pillars.data.boxes.box_records import BoxRecords, can_be_written, json_line, records_from
 from asca_pillars.data.boxes.box_split import DATASET_FILE, BoxDataset, find_frames, frame_id_of
-from asca_pillars.data.importing.foreign_values import LeftOut, text_of
+from asca_pillars.data.importing.foreign_values import SkippedEntries, text_of
 from asca_pillars.data.kitti import write_image_set
 from asca_pillars.data.yaw_units import check_yaws
 from asca_pillars.scans.find_scans import natural_order
@@ -45,7 +45,7 @@ class Imported(NamedTuple):
 
     settings: BoxDataset
     frames: Sequence[ImportedFrame]
-    left_out: LeftOut
+    left_out: SkippedEntries
 
 
 class ImportCounts(NamedTuple):
@@ -57,7 +57,7 @@ class ImportCounts(NamedTuple):
     doubt: str | None
 
 
-def usable(imported: Imported) -> Imported:
+def drop_unwritable(imported: Imported) -> Imported:
     """Return the import without boxes and frames that a dataset could not represent; they are counted.
 
     Line breaks and blanks at the ends are removed from names of classes.
@@ -100,7 +100,7 @@ def _readable_id(frame: ImportedFrame, scans: Path) -> str:
     return frame_id
 
 
-def _usable_records(frame: ImportedFrame, left_out: LeftOut) -> BoxRecords:
+def _usable_records(frame: ImportedFrame, left_out: SkippedEntries) -> BoxRecords:
     boxes, types, scores, track_ids = frame.records
     kept: dict[int, str] = {}
     for row, (kind, can) in enumerate(zip(types, can_be_written(boxes), strict=True)):
@@ -117,7 +117,7 @@ def _usable_records(frame: ImportedFrame, left_out: LeftOut) -> BoxRecords:
     return records_from(boxes[rows], list(kept.values()), scores[rows], tracks)
 
 
-def renamed(imported: Imported, names: Mapping[str, str]) -> Imported:
+def rename_types(imported: Imported, names: Mapping[str, str]) -> Imported:
     """Return the import with renamed classes; several may get one name.
 
     Raises:
@@ -168,7 +168,7 @@ def write_imported(out: Path, imported: Imported, val_share: float) -> ImportCou
 
     Args:
         out: folder of the dataset.
-        imported: frames that are `usable`.
+        imported: frames that are `drop_unwritable`.
         val_share: share of the recordings or, of only one, of its frames that is for validation.
 
     Raises:

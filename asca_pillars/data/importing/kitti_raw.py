@@ -18,7 +18,7 @@ from asca_pillars.base.errors import DatasetError
 from asca_pillars.base.input_files import read_text
 from asca_pillars.data.boxes.box_records import records_from
 from asca_pillars.data.boxes.box_split import BoxDataset
-from asca_pillars.data.importing.foreign_values import LeftOut, numbers, text_of
+from asca_pillars.data.importing.foreign_values import SkippedEntries, numbers, text_of
 from asca_pillars.data.importing.imported import Imported, ImportedFrame
 from asca_pillars.data.importing.kitti_tracking import LABELED_VIEW_DEG, TYPES
 from asca_pillars.scans.find_scans import files_below, visible_files
@@ -45,13 +45,13 @@ def read_kitti_raw(root: Path) -> Imported:
     drives = sorted(path.parent for path in files_below(root.resolve()) if path.name == LABELS)
     if not drives:
         raise DatasetError(f"{root}: no {LABELS} below; give a folder of KITTI's drives, with their tracklets")
-    left_out = LeftOut()
+    left_out = SkippedEntries()
     bar = track(drives, "Reading drives", transient=True)
     frames = [frame for drive in bar for frame in _frames(drive, left_out)]
     return Imported(BoxDataset(scans=str(root.resolve()), labeled_view_deg=LABELED_VIEW_DEG), frames, left_out)
 
 
-def _frames(drive: Path, left_out: LeftOut) -> list[ImportedFrame]:
+def _frames(drive: Path, left_out: SkippedEntries) -> list[ImportedFrame]:
     labels = _read_tracklets(drive / LABELS, left_out)
     frames = []
     for scan in visible_files(drive / "velodyne_points" / "data", "*.bin"):
@@ -61,7 +61,7 @@ def _frames(drive: Path, left_out: LeftOut) -> list[ImportedFrame]:
     return frames
 
 
-def _read_tracklets(path: Path, left_out: LeftOut) -> dict[int, _Labels]:
+def _read_tracklets(path: Path, left_out: SkippedEntries) -> dict[int, _Labels]:
     """Read the labels of each frame."""
     labels: dict[int, _Labels] = defaultdict(lambda: _Labels([], [], []))
     try:
@@ -81,7 +81,9 @@ def _read_tracklets(path: Path, left_out: LeftOut) -> dict[int, _Labels]:
     return dict(labels)
 
 
-def _add(labels: dict[int, _Labels], number: int, tracklet: ElementTree.Element, left_out: LeftOut, path: Path) -> None:
+def _add(
+    labels: dict[int, _Labels], number: int, tracklet: ElementTree.Element, left_out: SkippedEntries, path: Path
+) -> None:
     """Add the boxes of a tracklet to their frames; ValueError if it has no type, size or first frame."""
     height, width, length = _numbers(tracklet, "hwl")
     kind = text_of(tracklet.findtext("objectType", ""), "objectType")

@@ -14,7 +14,7 @@ from asca_pillars.base.errors import DatasetError
 from asca_pillars.base.input_files import read_text
 from asca_pillars.data.boxes.box_records import BoxRecords, records_from
 from asca_pillars.data.boxes.box_split import BoxDataset
-from asca_pillars.data.importing.foreign_values import LeftOut
+from asca_pillars.data.importing.foreign_values import SkippedEntries
 from asca_pillars.data.importing.imported import Imported, ImportedFrame
 from asca_pillars.data.kitti import Calibration, KittiObject, boxes_from_objects, parse_object, read_calibration
 from asca_pillars.scans.find_scans import visible_files
@@ -40,14 +40,14 @@ def read_kitti_tracking(root: Path) -> Imported:
     labels = visible_files(folder / "label_02", "*.txt")
     if not labels:
         raise DatasetError(f"{folder}: no label_02/*.txt there; give the folder of KITTI's tracking benchmark")
-    left_out = LeftOut()
+    left_out = SkippedEntries()
     bar = track(labels, "Reading sequences", transient=True)
     frames = [frame for path in bar for frame in _frames(folder.resolve(), path, left_out)]
     settings = BoxDataset(scans=str(folder.resolve() / "velodyne"), labeled_view_deg=LABELED_VIEW_DEG)
     return Imported(settings, frames, left_out)
 
 
-def _frames(folder: Path, labels: Path, left_out: LeftOut) -> list[ImportedFrame]:
+def _frames(folder: Path, labels: Path, left_out: SkippedEntries) -> list[ImportedFrame]:
     sequence = labels.stem
     calibration = read_calibration(folder / "calib" / f"{sequence}.txt")
     tracked = _read_tracked(labels, left_out)
@@ -65,7 +65,7 @@ def _records(own: list[_Tracked], calibration: Calibration) -> BoxRecords:
     return records_from(boxes, [TYPES.get(item.type, item.type) for item in objects], None, [track for _, track in own])
 
 
-def _read_tracked(path: Path, left_out: LeftOut) -> dict[int, list[_Tracked]]:
+def _read_tracked(path: Path, left_out: SkippedEntries) -> dict[int, list[_Tracked]]:
     """Read the objects of each frame with their track numbers."""
     try:
         lines = read_text(path, DatasetError, errors="replace").splitlines()

@@ -22,9 +22,9 @@ from asca_pillars.base.files import file_inside
 from asca_pillars.base.input_files import read_text
 from asca_pillars.data.boxes.box_records import BoxRecords, records_from
 from asca_pillars.data.boxes.box_split import BoxDataset
-from asca_pillars.data.importing.foreign_values import LeftOut, entry, numbers, text_of
+from asca_pillars.data.importing.foreign_values import SkippedEntries, entry, numbers, text_of
 from asca_pillars.data.importing.imported import Imported, ImportedFrame
-from asca_pillars.geometry.rotations import of_quaternions
+from asca_pillars.geometry.rotations import rotations_from_quaternions
 
 CHANNEL = "LIDAR_TOP"
 DETECTION_CLASSES = {
@@ -60,7 +60,7 @@ def read_nuscenes(root: Path) -> Imported:
     """
     tables = _tables_folder(root)
     data = tables.absolute().parent.resolve()
-    left_out = LeftOut()
+    left_out = SkippedEntries()
     names = ("sensor", "calibrated_sensor", "ego_pose", "sample", "scene", "category", "instance", "sample_annotation")
     read = {name: _table(tables, name, left_out) for name in (*names, "sample_data")}
     frames = _frames(read, tables, data, left_out)
@@ -80,7 +80,7 @@ def _sensor_height_m(tables: Mapping[str, _Table]) -> float | None:
     return round(float(np.median(heights)), 3) if heights else None
 
 
-def _frames(tables: Mapping[str, _Table], folder: Path, data: Path, left_out: LeftOut) -> list[ImportedFrame]:
+def _frames(tables: Mapping[str, _Table], folder: Path, data: Path, left_out: SkippedEntries) -> list[ImportedFrame]:
     labels: dict[str, list[_Row]] = {}
     for token, row in tables["sample_annotation"].items():
         try:
@@ -114,7 +114,7 @@ def _records(
     changes: list[tuple[_Doubles, _Doubles]],
     tables: Mapping[str, _Table],
     folder: Path,
-    left_out: LeftOut,
+    left_out: SkippedEntries,
 ) -> BoxRecords:
     boxes, types, tracks = [], [], []
     for label in labels:
@@ -137,7 +137,7 @@ def _records(
 
 def _change(row: _Row) -> tuple[_Doubles, _Doubles]:
     """Return the rotation (3, 3) and translation (3,), metres, of a row, to its parent frame."""
-    turn = of_quaternions(numbers(entry(row, "rotation"), 4, "rotation"))
+    turn = rotations_from_quaternions(numbers(entry(row, "rotation"), 4, "rotation"))
     if not np.isfinite(turn).all():
         raise ValueError(f"rotation is {row['rotation']}, no quaternion")
     return turn, numbers(entry(row, "translation"), 3, "translation")
@@ -165,7 +165,7 @@ def _tables_folder(root: Path) -> Path:
     return found[0]
 
 
-def _table(folder: Path, name: str, left_out: LeftOut) -> _Table:
+def _table(folder: Path, name: str, left_out: SkippedEntries) -> _Table:
     """Read the rows of a table by their tokens."""
     path = folder / f"{name}.json"
     try:

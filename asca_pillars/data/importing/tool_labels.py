@@ -17,7 +17,7 @@ from asca_pillars.base.input_files import read_text
 from asca_pillars.base.own_files import json_object, require_no_link, require_own_file
 from asca_pillars.data.boxes.box_records import BoxRecords, read_frames, records_from
 from asca_pillars.data.importing.box_files import dataset_settings
-from asca_pillars.data.importing.foreign_values import LeftOut, entry, numbers, text_of
+from asca_pillars.data.importing.foreign_values import SkippedEntries, entry, numbers, text_of
 from asca_pillars.data.importing.formats import FORMATS, TOOLS
 from asca_pillars.data.importing.imported import Imported, ImportedFrame
 from asca_pillars.data.yaw_units import yaw_error
@@ -82,7 +82,7 @@ def read_tool_labels(
     scan_of = _scans_by_name(Path(dataset.scans))
     paths = [source] if source.is_file() else sorted(files_below(source), key=natural_order)
     root = source.parent if source.is_file() else source
-    left_out, frames = LeftOut(), []
+    left_out, frames = SkippedEntries(), []
     for path in paths:
         relative = path.relative_to(root)
         if path.suffix.lower() != suffix or is_hidden(relative) or path.name in left or path.name.startswith("_"):
@@ -192,7 +192,7 @@ def _written(out: Path) -> dict[str, dict[str, list[str]]]:
     return json.loads(path.read_text(encoding="utf-8")) if path.exists() and path.stat().st_size else {}
 
 
-def _records(boxes: Iterable[ToolBox], path: Path, left_out: LeftOut) -> BoxRecords:
+def _records(boxes: Iterable[ToolBox], path: Path, left_out: SkippedEntries) -> BoxRecords:
     rows, types, tracks = [], [], []
     for number, box in enumerate(boxes, start=1):
         try:
@@ -226,8 +226,8 @@ def _scans_by_name(scans: Path) -> Callable[[Path, Path], Path]:
         stem = name.stem if name.suffix.lower() in SCAN_SUFFIXES else name.name  # 000000.pcd.json, 000000.json
         candidates = by_stem.get(stem, [])
         if len(candidates) > 1:
-            wanted = place(relative.parent)
-            candidates = [scan for scan in candidates if place(scan.parent.relative_to(scans)) == wanted]
+            label_place = place(relative.parent)
+            candidates = [scan for scan in candidates if place(scan.parent.relative_to(scans)) == label_place]
         if len(candidates) != 1:
             found = " and ".join(map(str, candidates[:2])) or "none"
             raise DatasetError(f"{path}: belongs to one scan {stem}.* below {scans}, there is {found}; correct --scans")

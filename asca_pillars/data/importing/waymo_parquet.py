@@ -20,7 +20,7 @@ from asca_pillars.base.errors import DatasetError
 from asca_pillars.base.files import atomic_path, portable_name, write_text
 from asca_pillars.data.boxes.box_records import BoxRecords, records_from
 from asca_pillars.data.boxes.box_split import DATASET_FILE, BoxDataset
-from asca_pillars.data.importing.foreign_values import LeftOut, numbers, text_of, whole_number
+from asca_pillars.data.importing.foreign_values import SkippedEntries, numbers, text_of, whole_number
 from asca_pillars.data.importing.imported import MARKER, Imported, ImportedFrame, require_own_dataset
 from asca_pillars.data.importing.parquet_rows import parquet_rows
 from asca_pillars.data.importing.waymo_range_image import Doubles, LidarCalibration, range_image_points
@@ -62,7 +62,7 @@ def read_waymo(root: Path, out: Path) -> Imported:
     if not (out / DATASET_FILE).exists():
         # Written first, so that an interrupted import can be repeated.
         write_text(out / DATASET_FILE, MARKER)
-    scans, left_out = out.resolve() / "scans", LeftOut()
+    scans, left_out = out.resolve() / "scans", SkippedEntries()
     frames: list[ImportedFrame] = []
     for path in track(segments, "Reading segments", transient=True):
         labels = _labels(root / "lidar_box" / path.name, left_out)
@@ -70,7 +70,7 @@ def read_waymo(root: Path, out: Path) -> Imported:
         folder = scans / portable_name(path.stem)
         times = _write_scans(root, path, folder, left_out)
         frames += [ImportedFrame(_scan_path(folder, time), labels.get(time, nothing), path.stem) for time in times]
-    top = _calibrations(root / "lidar_calibration" / segments[0].name, LeftOut()).get(TOP)
+    top = _calibrations(root / "lidar_calibration" / segments[0].name, SkippedEntries()).get(TOP)
     x, y, z = np.zeros(3) if top is None else np.round(top.vehicle_from_lidar[:3, 3], 3).tolist()
     settings = BoxDataset(sensor_height=0.0, reflectance_scale=1.0, scans=str(scans), sensor_position=(x, y, z))
     return Imported(settings, frames, left_out)
@@ -80,7 +80,7 @@ def _scan_path(folder: Path, time: int) -> Path:
     return folder / f"{portable_name(str(time))}.npy"
 
 
-def _write_scans(root: Path, lidar: Path, folder: Path, left_out: LeftOut) -> list[int]:
+def _write_scans(root: Path, lidar: Path, folder: Path, left_out: SkippedEntries) -> list[int]:
     """Write the scans of a segment that are not there yet; the times of all that are there then."""
     missing = _images_of_times(lidar, left_out)
     times = sorted(missing)
@@ -116,7 +116,7 @@ def _write_scans(root: Path, lidar: Path, folder: Path, left_out: LeftOut) -> li
     return times
 
 
-def _images_of_times(lidar: Path, left_out: LeftOut) -> Counter[int]:
+def _images_of_times(lidar: Path, left_out: SkippedEntries) -> Counter[int]:
     """Return the number of rows, one for each sensor, of each frame of a segment."""
     rows: Counter[int] = Counter()
     for number, row in enumerate(parquet_rows(lidar, (_TIME,))):
@@ -145,7 +145,7 @@ def _points(
     ]
 
 
-def _labels(path: Path, left_out: LeftOut) -> dict[int, BoxRecords]:
+def _labels(path: Path, left_out: SkippedEntries) -> dict[int, BoxRecords]:
     """Read the boxes of each frame."""
     boxes: dict[int, list[NDArray[np.float64]]] = defaultdict(list)
     types: dict[int, list[str]] = defaultdict(list)
@@ -165,7 +165,7 @@ def _labels(path: Path, left_out: LeftOut) -> dict[int, BoxRecords]:
     return {time: records_from(np.array(own), types[time], None, objects[time]) for time, own in boxes.items()}
 
 
-def _calibrations(path: Path, left_out: LeftOut) -> dict[int, LidarCalibration]:
+def _calibrations(path: Path, left_out: SkippedEntries) -> dict[int, LidarCalibration]:
     """Read the calibration of each sensor, by its number."""
     columns = (_LASER, _EXTRINSIC, *(f"{_INCLINATION}.{part}" for part in ("values", "min", "max")))
     found = {}
@@ -194,7 +194,7 @@ def _rigid(values: Any, name: str) -> Doubles:
     return matrix
 
 
-def _vehicle_poses(path: Path, left_out: LeftOut) -> dict[int, Doubles]:
+def _vehicle_poses(path: Path, left_out: SkippedEntries) -> dict[int, Doubles]:
     """Read the transform (4, 4) of each frame from the vehicle to the world; empty if it was not downloaded."""
     poses: dict[int, Doubles] = {}
     for number, row in enumerate(parquet_rows(path, (_TIME, _VEHICLE_POSE)) if path.is_file() else ()):
@@ -205,7 +205,7 @@ def _vehicle_poses(path: Path, left_out: LeftOut) -> dict[int, Doubles]:
     return poses
 
 
-def _pixel_poses(path: Path, left_out: LeftOut) -> Iterator[tuple[int, NDArray[np.float32]]]:
+def _pixel_poses(path: Path, left_out: SkippedEntries) -> Iterator[tuple[int, NDArray[np.float32]]]:
     """Yield time and poses (H, W, 6) of each frame, of the sensor that has them; nothing if not downloaded."""
     columns = (_TIME, _LASER, f"{_PIXEL_POSE}.values", f"{_PIXEL_POSE}.shape")
     for number, row in enumerate(parquet_rows(path, columns) if path.is_file() else ()):

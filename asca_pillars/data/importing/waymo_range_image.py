@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from asca_pillars.geometry.rotations import of_roll_pitch_yaw
+from asca_pillars.geometry.rotations import rotations_from_roll_pitch_yaw
 
 Doubles = NDArray[np.float64]
 _CHANNELS = 2
@@ -69,7 +69,7 @@ def range_image_points(
     points = points @ extrinsic[:3, :3].T + extrinsic[:3, 3]
     if pixel_poses is not None and world_from_vehicle is not None:
         poses = pixel_poses[rows, columns].astype(np.float64)
-        world = np.einsum("nij,nj->ni", of_roll_pitch_yaw(poses[:, :3]), points) + poses[:, 3:]
+        world = np.einsum("nij,nj->ni", rotations_from_roll_pitch_yaw(poses[:, :3]), points) + poses[:, 3:]
         points = (world - world_from_vehicle[:3, 3]) @ world_from_vehicle[:3, :3]
     reflectance = np.tanh(np.maximum(image[rows, columns, 1], 0))
     found = np.column_stack([points, reflectance])

@@ -46,19 +46,19 @@ class Scene:
 
     def add(self, item: StoredObject) -> None:
         """Insert an object at its box."""
-        self._hidden |= self._owned_rays.entering(item.box[None])
-        self._seen_points = [*self._seen_with(item), self._seen_of(item)]
+        self._hidden |= self._owned_rays.hitting_boxes(item.box[None])
+        self._seen_points = [*self._visible_points_with(item), self._visible_points(item)]
         self.inserted.append(item)
         self.obstacles = np.concatenate([self.obstacles, item.box[None]])
 
-    def shows_all_with(self, item: StoredObject) -> bool:
+    def keeps_all_visible(self, item: StoredObject) -> bool:
         """Return whether most points of every object, `item` included, stay visible if `item` is added."""
-        seen = ~(self._hidden | self._owned_rays.entering(item.box[None]))
+        seen = ~(self._hidden | self._owned_rays.hitting_boxes(item.box[None]))
         if (np.count_nonzero(self._wanted & seen, axis=1) < self._enough).any():
             return False
-        if len(self._seen_of(item)) < MIN_SEEN_SHARE * len(item.points):
+        if len(self._visible_points(item)) < MIN_SEEN_SHARE * len(item.points):
             return False
-        after = zip(self._seen_with(item), self.inserted, strict=True)
+        after = zip(self._visible_points_with(item), self.inserted, strict=True)
         return all(len(points) >= MIN_SEEN_SHARE * len(other.points) for points, other in after)
 
     def frame_with_inserted(self, min_points: int) -> LabeledFrame:
@@ -78,12 +78,12 @@ class Scene:
             labels=np.concatenate([labels, added.astype(np.int64)]),
         )
 
-    def _seen_of(self, item: StoredObject) -> Singles:
+    def _visible_points(self, item: StoredObject) -> Singles:
         """Return the points of `item` that no inserted object occludes."""
         hiding = [other.box for other in self.inserted if _share_azimuths(other.box, item.box)]
         return item.points[~rays_entering(item.points, np.array(hiding))] if hiding else item.points
 
-    def _seen_with(self, item: StoredObject) -> list[Singles]:
+    def _visible_points_with(self, item: StoredObject) -> list[Singles]:
         """Return the points of each inserted object that neither another one nor `item` occludes."""
         return [
             points[~rays_entering(points, item.box[None])] if _share_azimuths(other.box, item.box) else points
@@ -98,7 +98,7 @@ class Rays:
         self._ends = np.ascontiguousarray(points[:, :3].T, dtype=np.float64)
         self._reach = np.hypot(self._ends[0], self._ends[1]) * (1 + 1e-5) + 1e-3
 
-    def entering(self, boxes: Floating) -> Mask:
+    def hitting_boxes(self, boxes: Floating) -> Mask:
         """Return the mask (N,) of the rays that touch one of boxes (M, 7), LiDAR frame, their ends included."""
         px, py, _ = self._ends
         hits = np.zeros(len(px), bool)
@@ -125,7 +125,7 @@ def rays_entering(points: Floating, boxes: Floating) -> Mask:
 
     All in the LiDAR frame.
     """
-    return Rays(points).entering(boxes)
+    return Rays(points).hitting_boxes(boxes)
 
 
 def is_clear(box: Floating, obstacles: Floating, ranges: Ranges) -> bool:
@@ -139,7 +139,7 @@ def is_clear(box: Floating, obstacles: Floating, ranges: Ranges) -> bool:
     ).any()
 
 
-def to_free_place(
+def move_to_free_position(
     item: StoredObject, space: FreeSpace, scene: Scene, ranges: Ranges, rng: np.random.Generator
 ) -> StoredObject | None:
     """Return the object rotated about the sensor's vertical axis to a free place, or None if there is none."""
@@ -163,7 +163,7 @@ def to_free_place(
             continue
         box[2] = space.ground.heights(box[None, :2])[0] + box[5] / 2
         turned = _turned(item, box, float(azimuths[place]) - azimuth_rad)
-        if scene.shows_all_with(turned):
+        if scene.keeps_all_visible(turned):
             return turned
     return None
 

@@ -15,7 +15,7 @@ from zipfile import BadZipFile
 import cv2
 import numpy as np
 
-from asca_pillars.base.processes import in_processes
+from asca_pillars.base.processes import map_in_processes
 from asca_pillars.data.insertion.ground_fit import (
     GROUND_BAND_M,
     LATTICE_M,
@@ -25,7 +25,7 @@ from asca_pillars.data.insertion.ground_fit import (
     fit_ground,
     order_by_cell,
 )
-from asca_pillars.data.insertion.prepared import require_writable, writing
+from asca_pillars.data.insertion.prepared import require_writable, writable_atomic_path
 from asca_pillars.data.labeled_split import LabeledSplit
 from asca_pillars.geometry.arrays import Floating, Floats, Ints, Mask, Singles
 from asca_pillars.geometry.boxes import footprints
@@ -165,7 +165,7 @@ def prepare_free_spaces(split: LabeledSplit, prepared: Path, *, camera_view: boo
     """
     require_writable(prepared)
     job = partial(_prepare, split, prepared, camera_view)
-    for _ in in_processes(job, split.frame_ids, workers, "Free ground", at_once=_AT_ONCE):
+    for _ in map_in_processes(job, split.frame_ids, workers, "Free ground", at_once=_AT_ONCE):
         pass
 
 
@@ -210,7 +210,7 @@ def _read(path: Path, stamp: Ints) -> FreeSpace | None:
 
 def _write(path: Path, stamp: Ints, space: FreeSpace) -> None:
     ground = space.ground or Ground(np.zeros(3), np.zeros(2), np.zeros((0, 0), np.float16))
-    with writing(path) as temporary:
+    with writable_atomic_path(path) as temporary:
         np.savez(
             temporary,
             stamp=stamp,

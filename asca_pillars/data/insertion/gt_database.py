@@ -24,9 +24,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_pillars.base.files import portable_name
-from asca_pillars.base.processes import in_processes
+from asca_pillars.base.processes import map_in_processes
 from asca_pillars.data.frames import read_frame
-from asca_pillars.data.insertion.prepared import require_writable, writing
+from asca_pillars.data.insertion.prepared import require_writable, writable_atomic_path
 from asca_pillars.data.labeled_split import LabeledSplit
 from asca_pillars.geometry.boxes import points_in_boxes
 
@@ -119,7 +119,7 @@ def prepare_database(
     if not path.exists():
         require_writable(prepared)
         read = partial(_read_objects, split, tuple(class_names), camera_view)
-        _build(path, in_processes(read, split.frame_ids, workers, "Object database", at_once=_AT_ONCE), built_from)
+        _build(path, map_in_processes(read, split.frame_ids, workers, "Object database", at_once=_AT_ONCE), built_from)
     return ObjectDatabase(path)
 
 
@@ -155,7 +155,7 @@ def _read_objects(split: LabeledSplit, class_names: Sequence[str], camera_view: 
 def _build(path: Path, frames: Iterable[_FrameObjects], built_from: dict[str, Any]) -> None:
     boxes, labels, counts = [np.zeros((0, 7), np.float32)], [np.zeros(0, np.int64)], [np.zeros(1, np.int64)]
     numbers = [np.zeros(0, np.int64)]
-    with writing(path.with_suffix(".npy")) as temporary, temporary.open("wb") as file:
+    with writable_atomic_path(path.with_suffix(".npy")) as temporary, temporary.open("wb") as file:
         # Points are gigabytes for a large list: they are written to the file directly.
         _write_header(file, 0)
         for number, frame in enumerate(frames):
@@ -168,7 +168,7 @@ def _build(path: Path, frames: Iterable[_FrameObjects], built_from: dict[str, An
         file.seek(0)
         _write_header(file, int(first[-1]))
     all_labels = np.concatenate(labels)
-    with writing(path.with_suffix(".npz")) as temporary:
+    with writable_atomic_path(path.with_suffix(".npz")) as temporary:
         np.savez(
             temporary,
             boxes=np.concatenate(boxes),
@@ -178,7 +178,7 @@ def _build(path: Path, frames: Iterable[_FrameObjects], built_from: dict[str, An
         )
     names = built_from["class_names"]
     objects = np.bincount(all_labels, minlength=len(names)).tolist()
-    with writing(path) as temporary:
+    with writable_atomic_path(path) as temporary:
         text = json.dumps({**built_from, "objects": dict(zip(names, objects, strict=True))}, indent=2)
         temporary.write_text(text + "\n", encoding="utf-8")
 

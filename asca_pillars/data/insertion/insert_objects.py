@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from asca_pillars.base.errors import DatasetError
 from asca_pillars.config.tree import DataConfig, InsertConfig
 from asca_pillars.data.frames import LabeledFrame, other_spelling
-from asca_pillars.data.insertion.free_placement import Scene, is_clear, to_free_place
+from asca_pillars.data.insertion.free_placement import Scene, is_clear, move_to_free_position
 from asca_pillars.data.insertion.free_space import FreeSpace, load_free_space
 from asca_pillars.data.insertion.gt_database import ObjectDatabase, StoredObject, prepare_database
 from asca_pillars.data.insertion.prepared import prepared_folder
@@ -149,28 +149,28 @@ def insert_objects(frame: LabeledFrame, inserter: Inserter, rng: np.random.Gener
     change = inserter.split.to_sensor
     space = inserter.free_space(frame.frame_id) if inserter.settings.method == "rs_aug" else None
     labeled = inserter.split.labeled_boxes(frame.frame_id).boxes  # of all types, including unlearned ones
-    scene = Scene(_changed(frame, change), labeled if change.is_identity else change.boxes(labeled))
+    scene = Scene(_apply_change(frame, change), labeled if change.is_identity else change.boxes(labeled))
     ranges = inserter.ranges.shifted(change.shift_m)
     for label in rng.choice(len(inserter.shares), inserter.settings.objects, p=inserter.shares):
         for _ in range(OBJECT_TRIES):
-            item = _object_changed(inserter.database[int(rng.choice(inserter.candidates[label]))], change)
+            item = _apply_change_to_object(inserter.database[int(rng.choice(inserter.candidates[label]))], change)
             if space is not None:
-                placed = to_free_place(item, space, scene, ranges, rng)
+                placed = move_to_free_position(item, space, scene, ranges, rng)
             else:
                 placed = item if is_clear(item.box, scene.obstacles, ranges) else None
             if placed is not None:
                 scene.add(placed)
                 break
-    return _changed(scene.frame_with_inserted(inserter.min_points), change.inverse)
+    return _apply_change(scene.frame_with_inserted(inserter.min_points), change.inverse)
 
 
-def _changed(frame: LabeledFrame, change: FrameChange) -> LabeledFrame:
+def _apply_change(frame: LabeledFrame, change: FrameChange) -> LabeledFrame:
     if change.is_identity:
         return frame
     return replace(frame, points=change.points(frame.points), boxes=change.boxes(frame.boxes))
 
 
-def _object_changed(item: StoredObject, change: FrameChange) -> StoredObject:
+def _apply_change_to_object(item: StoredObject, change: FrameChange) -> StoredObject:
     if change.is_identity:
         return item
     return item._replace(box=change.boxes(item.box[None])[0], points=change.points(item.points))

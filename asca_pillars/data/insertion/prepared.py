@@ -28,12 +28,12 @@ def require_writable(folder: Path) -> None:
     notes = (PREPARED_FILE, *(path.relative_to(folder).as_posix() for path in folder.glob(f"*/*/{PREPARED_FILE}")))
     below = [Path(at, name).relative_to(folder) for at, names, _ in os.walk(folder) for name in names]
     require_own(folder, "asca prepare", dict.fromkeys(notes, starting_with(PREPARED_NOTE)), folders=below)
-    with writing(folder / PREPARED_FILE) as temporary:
+    with writable_atomic_path(folder / PREPARED_FILE) as temporary:
         temporary.write_text(PREPARED_NOTE, encoding="utf-8")
 
 
 @contextlib.contextmanager
-def writing(path: Path) -> Iterator[Path]:
+def writable_atomic_path(path: Path) -> Iterator[Path]:
     """Open `atomic_path`, in a folder that may be read-only.
 
     Raises:

@@ -71,7 +71,7 @@ def count_points(points: NDArray[np.float32], boxes: NDArray[np.float32]) -> NDA
     for column, box in enumerate(boxes):
         reach = np.hypot(box[3], box[4]) / 2 + 0.01
         candidates = points[(np.abs(points[:, 0] - box[0]) < reach) & (np.abs(points[:, 1] - box[1]) < reach)]
-        counts[:, column] = points_in_boxes(candidates, _changed(box)).sum(axis=0)
+        counts[:, column] = points_in_boxes(candidates, _by_conventions(box)).sum(axis=0)
     return counts
 
 
@@ -93,7 +93,7 @@ def better_convention(fits: Sequence[ConventionFit]) -> tuple[Convention, Conven
     return max(better, key=lambda item: item[1].more - item[1].fewer) if better else None
 
 
-def _changed(box: NDArray[np.float32]) -> NDArray[np.float32]:
+def _by_conventions(box: NDArray[np.float32]) -> NDArray[np.float32]:
     """Return the box (7,) in each convention: (C, 7)."""
     boxes = np.repeat(box[None], len(CONVENTIONS), axis=0)
     for row, convention in zip(boxes, CONVENTIONS, strict=True):

@@ -50,25 +50,25 @@ def findings(inspection: Inspection, spec: InspectedSpec, min_points: int) -> li
     for facts in inspection.classes:
         if facts.positives == 0:
             frames = f"{inspection.frames} of {inspection.frames_in_split} frames of '{inspection.split}'"
-            text = (
-                f"no anchor is positive for {facts.name} in {frames}: {_why_none(facts, inspection, spec, min_points)}"
-            )
+            reason = _no_objects_reason(facts, inspection, spec, min_points)
+            text = f"no anchor is positive for {facts.name} in {frames}: {reason}"
             problems.append(Finding("error", facts.name, text))
     for facts in inspection.classes:
         if facts.positives:
             problems += [
-                Finding("warning", facts.name, f"{facts.name}: {text}") for text in _of_class(facts, spec, min_points)
+                Finding("warning", facts.name, f"{facts.name}: {text}")
+                for text in _class_findings(facts, spec, min_points)
             ]
     scans = inspection.scans
-    problems += [Finding("warning", "axes", text) for text in _of_axes(inspection)]
-    problems += [Finding("warning", "boxes", text) for text in _of_conventions(inspection)]
-    problems += [Finding("warning", "reflectance", text) for text in _of_reflectance(scans, inspection.frames)]
-    problems += [Finding("warning", "height", text) for text in _of_height(inspection)]
-    problems += [Finding("warning", "points", text) for text in _of_points(scans, inspection.frames, spec)]
+    problems += [Finding("warning", "axes", text) for text in _axes_findings(inspection)]
+    problems += [Finding("warning", "boxes", text) for text in _convention_findings(inspection)]
+    problems += [Finding("warning", "reflectance", text) for text in _reflectance_findings(scans, inspection.frames)]
+    problems += [Finding("warning", "height", text) for text in _height_findings(inspection)]
+    problems += [Finding("warning", "points", text) for text in _point_findings(scans, inspection.frames, spec)]
     return problems
 
 
-def _why_none(facts: ClassFacts, inspection: Inspection, spec: InspectedSpec, min_points: int) -> str:
+def _no_objects_reason(facts: ClassFacts, inspection: Inspection, spec: InspectedSpec, min_points: int) -> str:
     if facts.boxes == 0:
         return _why_no_boxes(facts.name, inspection)
     if facts.no_points == facts.boxes:
@@ -94,7 +94,7 @@ def _why_no_boxes(name: str, inspection: Inspection) -> str:
     return f"no label is of this type (there are: {there}); {advice}"
 
 
-def _of_class(facts: ClassFacts, spec: InspectedSpec, min_points: int) -> Iterator[str]:
+def _class_findings(facts: ClassFacts, spec: InspectedSpec, min_points: int) -> Iterator[str]:
     boxes = facts.boxes
     if boxes < FEWEST_BOXES:
         number = "1 box" if boxes == 1 else f"{boxes} boxes"
@@ -137,7 +137,7 @@ def _of_class(facts: ClassFacts, spec: InspectedSpec, min_points: int) -> Iterat
         )
 
 
-def _of_reflectance(scans: ScanFacts, frames: int) -> Iterator[str]:
+def _reflectance_findings(scans: ScanFacts, frames: int) -> Iterator[str]:
     low, high = scans.reflectance_stored
     if low < 0:
         yield f"reflectance goes down to {low:.4g} and is cut off at 0; store it as 0..1"
@@ -164,7 +164,7 @@ def _of_reflectance(scans: ScanFacts, frames: int) -> Iterator[str]:
         )
 
 
-def _of_axes(inspection: Inspection) -> Iterator[str]:
+def _axes_findings(inspection: Inspection) -> Iterator[str]:
     if len(inspection.axes_warnings) <= ODD_SCANS * inspection.frames:
         return
     (_, axes), _ = Counter((warning.about, warning.axes) for warning in inspection.axes_warnings).most_common(1)[0]
@@ -177,7 +177,7 @@ def _of_axes(inspection: Inspection) -> Iterator[str]:
     yield f"{len(inspection.axes_warnings)} of {inspection.frames} scans are odd, the first: {first.text}: {remedy}"
 
 
-def _of_conventions(inspection: Inspection) -> Iterator[str]:
+def _convention_findings(inspection: Inspection) -> Iterator[str]:
     if inspection.yaws_doubt is not None:
         yield inspection.yaws_doubt
     if (better := better_convention(inspection.conventions)) is not None:
@@ -188,7 +188,7 @@ def _of_conventions(inspection: Inspection) -> Iterator[str]:
         )
 
 
-def _of_height(inspection: Inspection) -> Iterator[str]:
+def _height_findings(inspection: Inspection) -> Iterator[str]:
     if inspection.scans.ground_z_m is None:
         return
     ground, (low, high) = inspection.scans.ground_z_m.median, inspection.scans.anchor_bottoms_m
@@ -207,7 +207,7 @@ def _of_height(inspection: Inspection) -> Iterator[str]:
         )
 
 
-def _of_points(scans: ScanFacts, frames: int, spec: InspectedSpec) -> Iterator[str]:
+def _point_findings(scans: ScanFacts, frames: int, spec: InspectedSpec) -> Iterator[str]:
     if scans.dropped_points:
         yield (
             f"points with a value that is not finite: {scans.dropped_points}, in {scans.scans_with_dropped} of "

@@ -40,7 +40,7 @@ class InputCells:
     """
 
     name: str
-    of_points: Callable[[NDArray[np.floating[Any]]], NDArray[np.int64]]
+    indices_of: Callable[[NDArray[np.floating[Any]]], NDArray[np.int64]]
     max_points: int
     max_points_key: str
     max_cells: int | None
@@ -52,7 +52,7 @@ def input_cells(spec: InspectedSpec) -> InputCells:
     if isinstance(spec, PillarSpec):
         return InputCells(
             name="pillar",
-            of_points=spec.grid.cells,
+            indices_of=spec.grid.cells,
             max_points=spec.limits.max_points,
             max_points_key="model.spec.limits.max_points",
             max_cells=spec.limits.max_pillars,
@@ -61,7 +61,7 @@ def input_cells(spec: InspectedSpec) -> InputCells:
     finer = "make model.spec.grid.size_m smaller along x and y"
     return InputCells(
         name="voxel",
-        of_points=spec.grid.cells,
+        indices_of=spec.grid.cells,
         max_points=spec.grid.max_points,
         max_points_key="model.spec.grid.max_points",
         max_cells=None,
@@ -187,7 +187,7 @@ def measure_scan(
     finite = stored[np.isfinite(stored).all(axis=1)]
     ground = ground_z_m(finite)
     kind = input_cells(spec)
-    cells = kind.of_points(seen)
+    cells = kind.indices_of(seen)
     _, per_cell = np.unique(cells[cells >= 0], return_counts=True)
     return ScanMeasure(
         points=len(seen),

@@ -79,7 +79,7 @@ def propose(split: LabeledSplit, config: Config, *, frames: int = 500, progress:
         )
     measured = {kind: np.array(boxes_of[kind], np.float64) for kind in names}
     of_classes = [np.array(findable[kind] or boxes_of[kind], np.float64) for kind in names]
-    spec = _holding(config.model.spec, np.concatenate(of_classes))
+    spec = _with_ranges_holding(config.model.spec, np.concatenate(of_classes))
     spec = replace(spec, classes=tuple(_class(kind, boxes, spec) for kind, boxes in measured.items()))
     if isinstance(spec, PillarSpec):
         fullest = max(len(np.unique(cells[cells >= 0])) for cells in map(spec.grid.cells, clouds))
@@ -117,7 +117,7 @@ def _differences(settings: Any, plain: dict[str, Any]) -> dict[str, Any]:
     return changed
 
 
-def _holding(spec: InspectedSpec, boxes: Floats) -> InspectedSpec:
+def _with_ranges_holding(spec: InspectedSpec, boxes: Floats) -> InspectedSpec:
     """Return the spec with a grid of the same cells whose ranges contain the boxes (N, 7)."""
     grid, outside, changes = spec.grid, (1 - HELD) / 2, dict[str, Any]()
     looks_back = np.quantile(boxes[:, 0], outside) < min(BEHIND_M, grid.x_range_m[0])
@@ -131,7 +131,7 @@ def _holding(spec: InspectedSpec, boxes: Floats) -> InspectedSpec:
         depth_m, width_m, height_m = spec.grid.size_m
         steps_m = MAP_MULTIPLE * spec.map_stride * depth_m, MAP_MULTIPLE * spec.map_stride * width_m
     for column, (axis, span_m, step_m) in enumerate(zip("xy", (grid.x_range_m, grid.y_range_m), steps_m, strict=True)):
-        fitted = _around if looks_back else _widened
+        fitted = _symmetric if looks_back else _widened_range
         changes[f"{axis}_range_m"] = fitted(span_m, boxes[:, column], outside, step_m)
     low = np.quantile(boxes[:, 2] - boxes[:, 5] / 2, outside)
     high = np.quantile(boxes[:, 2] + boxes[:, 5] / 2, 1 - outside)
@@ -143,9 +143,9 @@ def _holding(spec: InspectedSpec, boxes: Floats) -> InspectedSpec:
     return replace(spec, grid=replace(grid, **(changes | ranges)))  # type: ignore[arg-type]  # its own grid
 
 
-def _around(span_m: tuple[float, float], centers: Floats, outside: float, step_m: float) -> tuple[float, float]:
+def _symmetric(span_m: tuple[float, float], centers: Floats, outside: float, step_m: float) -> tuple[float, float]:
     """Return a range as `_widened`, symmetric ahead and behind."""
-    if span_m[0] == -span_m[1] and _widened(span_m, centers, outside, step_m) == span_m:
+    if span_m[0] == -span_m[1] and _widened_range(span_m, centers, outside, step_m) == span_m:
         half = math.ceil(round(2 * span_m[1] / step_m, 6)) * step_m / 2  # whole steps, which may have changed
         return -half, half
     reach_m = float(np.quantile(np.abs(centers), 1 - outside))
@@ -153,7 +153,7 @@ def _around(span_m: tuple[float, float], centers: Floats, outside: float, step_m
     return -half, half
 
 
-def _widened(span_m: tuple[float, float], centers: Floats, outside: float, step_m: float) -> tuple[float, float]:
+def _widened_range(span_m: tuple[float, float], centers: Floats, outside: float, step_m: float) -> tuple[float, float]:
     low, high = np.quantile(centers, outside), np.quantile(centers, 1 - outside)
     if span_m[0] <= low and high < span_m[1]:
         return span_m

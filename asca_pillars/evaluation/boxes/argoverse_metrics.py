@@ -49,7 +49,7 @@ class ArgoverseScore:
 def argoverse_scores(frames: Sequence[EvaluatedFrame], class_names: Sequence[str]) -> list[ArgoverseScore]:
     """Compute a score for every class."""
     within = [_in_range(frame) for frame in frames]
-    return [_score(pair_class(within, name, _closeness), name) for name in class_names]
+    return [_score(pair_class(within, name, _similarity), name) for name in class_names]
 
 
 def aligned_size_error(boxes: Floats, objects: Floats) -> Floats:
@@ -65,7 +65,7 @@ def aligned_size_error(boxes: Floats, objects: Floats) -> Floats:
     return 1 - shared / np.maximum(boxes[:, 3:6], objects[:, 3:6]).prod(axis=1)
 
 
-def _closeness(boxes: Floats, objects: Floats) -> Floats:
+def _similarity(boxes: Floats, objects: Floats) -> Floats:
     return -np.linalg.norm(boxes[:, None, :3] - objects[None, :, :3], axis=2)
 
 
@@ -100,7 +100,7 @@ def _first_of_each(pairs: BoxPairs) -> tuple[NDArray[np.bool_], NDArray[np.int64
     kept, owner, distance_m = np.ones(count, dtype=bool), np.full(count, UNMATCHED), np.full(count, np.inf)
     taken, in_frame = np.zeros(len(pairs.objects), dtype=bool), dict.fromkeys(pairs.frames.tolist(), 0)
     for row, (number, first, close) in enumerate(
-        zip(pairs.frames.tolist(), pairs.first.tolist(), pairs.closeness, strict=True)
+        zip(pairs.frames.tolist(), pairs.first.tolist(), pairs.similarity, strict=True)
     ):
         in_frame[number] += 1
         kept[row] = in_frame[number] <= MAX_DETECTIONS

@@ -12,7 +12,7 @@ from asca_pillars.geometry.arrays import Floats, Ints, Mask
 
 UNMATCHED = -1
 
-Closeness = Callable[[Floats, Floats], Floats]
+Similarity = Callable[[Floats, Floats], Floats]
 """(N, 7), (M, 7) -> (N, M), larger is closer."""
 
 
@@ -58,14 +58,14 @@ class BoxPairs:
     frames: Ints
     objects: Floats
     first: Ints
-    closeness: tuple[Floats, ...]
-    excuse: Floats
+    similarity: tuple[Floats, ...]
+    ignored_similarity: Floats
 
     def match(self, close_enough: Callable[[float], bool]) -> Ints:
         """Return the index (N,) of the object matched to each detection, or UNMATCHED."""
         matched = np.full(len(self.scores), UNMATCHED)
         taken = np.zeros(len(self.objects), dtype=bool)
-        for row, (first, close) in enumerate(zip(self.first.tolist(), self.closeness, strict=True)):
+        for row, (first, close) in enumerate(zip(self.first.tolist(), self.similarity, strict=True)):
             if not len(close):
                 continue
             free = np.where(taken[first : first + len(close)], -np.inf, close)
@@ -76,12 +76,12 @@ class BoxPairs:
         return matched
 
 
-def pair_class(frames: Sequence[EvaluatedFrame], class_name: str, closeness: Closeness) -> BoxPairs:
+def pair_class(frames: Sequence[EvaluatedFrame], class_name: str, similarity: Similarity) -> BoxPairs:
     """Collect the detections and objects of one class over all frames.
 
     Objects without a point, and those of a neighboring type (KITTI's Van for Car), are not counted.
     """
-    found, scores, numbers, objects, first, rows, excuse = [], [], [], [], [], [], []
+    found, scores, numbers, objects, first, rows, ignored_similarity = [], [], [], [], [], [], []
     start = 0
     for number, frame in enumerate(frames):
         types = np.array(frame.object_types, dtype=object)
@@ -96,8 +96,8 @@ def pair_class(frames: Sequence[EvaluatedFrame], class_name: str, closeness: Clo
         numbers.append(np.full(len(boxes), number))
         objects.append(truth[counted])
         first.append(np.full(len(boxes), start))
-        rows += list(closeness(boxes, truth[counted]))
-        excuse.append(closeness(boxes, truth[spare]).max(axis=1, initial=-np.inf))
+        rows += list(similarity(boxes, truth[counted]))
+        ignored_similarity.append(similarity(boxes, truth[spare]).max(axis=1, initial=-np.inf))
         start += len(objects[-1])
     score = np.concatenate([*scores, np.zeros(0)])
     order = np.argsort(-score, kind="stable")
@@ -108,7 +108,7 @@ def pair_class(frames: Sequence[EvaluatedFrame], class_name: str, closeness: Clo
         np.concatenate([*objects, np.zeros((0, 7))]),
         np.concatenate([*first, np.zeros(0, np.int64)])[order],
         tuple(rows[row] for row in order),
-        np.concatenate([*excuse, np.zeros(0)])[order],
+        np.concatenate([*ignored_similarity, np.zeros(0)])[order],
     )
 
 

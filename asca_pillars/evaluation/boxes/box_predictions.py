@@ -180,14 +180,14 @@ def read_box_predictions(path: Path, split: LabeledSplit, *, reporter: Reporter 
         visible = np.asarray(points_in_boxes(points, objects).any(axis=0))
         records = predictions[frame_id].records
         found = records.boxes if level.is_identity else level.boxes(records.boxes)
-        kept = np.flatnonzero(_can_be_judged(split, frame_id, objects, found))
+        kept = np.flatnonzero(_can_be_evaluated(split, frame_id, objects, found))
         found_types = tuple(records.types[row] for row in kept)
         frames.append(EvaluatedFrame(frame_id, objects, types, visible, found[kept], found_types, records.scores[kept]))
     missing = tuple(frame_id for frame_id in split.frame_ids if frame_id not in predictions)
     return BoxFrames(tuple(frames), missing, stated_scope(path, predictions.values()))
 
 
-def _can_be_judged(
+def _can_be_evaluated(
     split: LabeledSplit, frame_id: str, objects: NDArray[np.float32], found: NDArray[np.float32]
 ) -> NDArray[np.bool_]:
     """Return the mask of the boxes (N, 7) in the labelled view, or close enough to one of `objects` to match it."""

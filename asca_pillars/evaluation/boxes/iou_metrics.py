@@ -40,7 +40,7 @@ def iou_scores(frames: Sequence[EvaluatedFrame], class_names: Sequence[str]) -> 
                 matched = match_by_iou(pairs, least)
                 for band in BANDS:
                     counted, hits, objects = in_band(pairs, matched, band)
-                    counted &= (matched != UNMATCHED) | (pairs.excuse < least)
+                    counted &= (matched != UNMATCHED) | (pairs.ignored_similarity < least)
                     ap = area_under_curve(hits[counted], objects)
                     scores.append(IouScore(name, metric, least, band, objects, ap))
     return scores
@@ -95,7 +95,7 @@ def fixed_scores(
     for name in class_names:
         pairs = pair_class(frames, name, lambda found, objects: -ground_distance(found, objects))
         matched = match_by_distance(pairs, MATCH_M)
-        excused = (matched == UNMATCHED) & (-pairs.excuse < MATCH_M)
+        excused = (matched == UNMATCHED) & (-pairs.ignored_similarity < MATCH_M)
         for band in BANDS:
             counted, hits, objects = in_band(pairs, matched, band)
             counted &= ~excused

@@ -64,7 +64,7 @@ def ground_distance(a: Floats, b: Floats) -> Floats:
 
 def match_by_distance(pairs: BoxPairs, limit_m: float) -> NDArray[np.int64]:
     """Return the index (N,) of the object matched to each detection at less than `limit_m`, or UNMATCHED."""
-    return pairs.match(lambda closeness: -closeness < limit_m)
+    return pairs.match(lambda similarity: -similarity < limit_m)
 
 
 def match_errors(boxes: Floats, objects: Floats) -> Floats:

@@ -48,7 +48,7 @@ def prepare_errors(who: str, split: LabeledSplit, by: str | None, beside: Sequen
     return ErrorAnalysis(f"{where}/{split.name}", named, tuple(read_report(path) for path in beside))
 
 
-def who_predicted(predictions: Path) -> str:
+def predictions_name(predictions: Path) -> str:
     """Return the model's name if `asca eval` wrote the predictions, else that of the file or folder."""
     made_by = (predictions if predictions.is_dir() else predictions.parent) / MADE_BY
     try:

@@ -40,7 +40,7 @@ _Doubles = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
-class Resamples:
+class BootstrapSamples:
     """Bootstrap samples, as counts of each frame.
 
     Attributes:
@@ -76,7 +76,7 @@ class Resamples:
         return _interval((self.weights @ parts)[drawn] / whole[drawn])
 
 
-def resamples(parts: Sequence[NDArray[np.int64]], frames: int) -> Resamples:
+def bootstrap_samples(parts: Sequence[NDArray[np.int64]], frames: int) -> BootstrapSamples:
     """Draw blocks of neighboring frames; the same draws for the same frames.
 
     Args:
@@ -92,7 +92,7 @@ def resamples(parts: Sequence[NDArray[np.int64]], frames: int) -> Resamples:
         for part in generator.integers(len(groups), size=len(groups)):
             for block in generator.integers(len(groups[part]), size=len(groups[part])):
                 row[groups[part][block]] += 1
-    return Resamples(weights, number_of)
+    return BootstrapSamples(weights, number_of)
 
 
 def _interval(drawn: _Doubles) -> tuple[float, float]:
@@ -275,7 +275,7 @@ def summarize(
     sets = []
     for title, groups in reporter.track(drawn.items(), "Intervals"):
         chosen = np.unique(np.concatenate(groups).astype(np.int64))
-        view = _Part(matches, np.isin(everything, chosen), resamples(groups, len(everything)))
+        view = _Part(matches, np.isin(everything, chosen), bootstrap_samples(groups, len(everything)))
         sets.append(DatasetErrors(title, len(chosen), tuple(view.class_errors(one) for one in matches.scores)))
     return sets
 
@@ -297,7 +297,7 @@ class _Part:
 
     matches: Matches
     frames: _Mask
-    draws: Resamples
+    draws: BootstrapSamples
 
     def class_errors(self, name: str) -> ClassErrors:
         rows = [
@@ -324,7 +324,7 @@ class _Part:
             best_score=_best_score([item for item, _ in detections], int(counted.sum())),
             iou_3d=iou,
             boxes=int((counted & boxes).sum()),
-            reaching=_reaching(labels[counted[boxes]], residuals[counted & boxes], iou),
+            reaching=_shares_reaching(labels[counted[boxes]], residuals[counted & boxes], iou),
             groups=tuple(
                 self._group(group, [objects[row] for row in np.flatnonzero(mask)], residuals[mask])
                 for group, mask in _groups(objects).items()
@@ -430,7 +430,7 @@ def _band(low: float, high: float, unit: str) -> str:
     return f"{low:g}+ {unit}" if high == inf else f"{low:g}-{high:g} {unit}"
 
 
-def _reaching(labels: NDArray[np.float64], residuals: NDArray[np.float64], iou: float) -> dict[str, float]:
+def _shares_reaching(labels: NDArray[np.float64], residuals: NDArray[np.float64], iou: float) -> dict[str, float]:
     if not len(labels):
         return {}
     boxes = {name: corrected(labels, residuals, name) for name in CORRECTIONS}

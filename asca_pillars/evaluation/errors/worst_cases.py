@@ -145,13 +145,13 @@ def _svg(panes: Sequence[_Pane], reach_cm: int) -> str:
         if pane.low[1] == _LOW_M:
             ground = round(100 * pane.high[1])
             parts.append(f'<path class="ground" d="M0 {ground}h{width}"/>')
-        shown = ((pane.points > pane.low) & (pane.points < pane.high)).all(axis=1)
+        visible = ((pane.points > pane.low) & (pane.points < pane.high)).all(axis=1)
         for style, mask in (
             ("far", ~pane.near),
             ("near", pane.near & ~pane.bright),
             ("bright", pane.near & pane.bright),
         ):
-            if path := _dots(pane, shown & mask):
+            if path := _dots(pane, visible & mask):
                 parts.append(f'<path class="{style}" d="{path}"/>')
         parts += [
             f'<polygon class="{style}" points="{" ".join(f"{x},{y}" for x, y in _pixels(pane, outline))}"/>'

@@ -48,7 +48,7 @@ class KittiReport:
     @property
     def title(self) -> str:
         """Subject and number of frames."""
-        return self.frames.titled(self.subject)
+        return self.frames.title_of(self.subject)
 
 
 def kitti_tables(report: KittiReport) -> list[TextTable]:
@@ -96,7 +96,7 @@ def kitti_json(report: KittiReport) -> dict[str, Any]:
     return {
         "subject": report.subject,
         "frames": len(report.frames),
-        "frames_asked": report.frames.asked,
+        "frames_asked": report.frames.requested,
         "frames_without_predictions": list(report.frames.without_predictions),
         "shortage": report.frames.shortage,
         "types_left_out": list(report.frames.foreign_types),

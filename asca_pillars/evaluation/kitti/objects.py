@@ -97,7 +97,7 @@ def frame_objects(frame_id: str, objects: Sequence[KittiObject]) -> FrameObjects
     )
 
 
-def stacked(frames: Sequence[FrameObjects]) -> FrameObjects:
+def concatenate_frames(frames: Sequence[FrameObjects]) -> FrameObjects:
     """Concatenate the objects of all frames, as one frame named ""."""
     if not frames:
         return frame_objects("", [])

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_pillars.base.progress import SILENT, Reporter
-from asca_pillars.evaluation.kitti.objects import FrameObjects, stacked
+from asca_pillars.evaluation.kitti.objects import FrameObjects, concatenate_frames
 from asca_pillars.evaluation.kitti.states import is_type
 from asca_pillars.geometry.overlap import paired_bev_intersection
 
@@ -42,7 +42,7 @@ class Frames:
         """Join ground truth and detections of the same frames, in the same order."""
         frames = np.repeat(np.arange(len(truth)), [len(frame) for frame in truth])
         starts = np.cumsum([0, *(len(frame) for frame in detections)])
-        return cls(stacked(truth), stacked(detections), frames, starts)
+        return cls(concatenate_frames(truth), concatenate_frames(detections), frames, starts)
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +66,9 @@ class Pairs:
         return Pairs(self.truth[keep], self.detection[keep], self.frame[keep], overlaps)
 
 
-def overlapping_pairs(frames: Frames, wanted: NDArray[np.bool_], above: float, *, reporter: Reporter = SILENT) -> Pairs:
+def overlapping_pairs(
+    frames: Frames, truth_mask: NDArray[np.bool_], above: float, *, reporter: Reporter = SILENT
+) -> Pairs:
     """Return the pairs whose boxes overlap by more than `above` in the image, in bird's-eye view or in 3D.
 
     Args:
@@ -75,7 +77,7 @@ def overlapping_pairs(frames: Frames, wanted: NDArray[np.bool_], above: float, *
     """
     truth_boxes, detection_boxes = _upright_boxes(frames.truth), _upright_boxes(frames.detections)
     found = []
-    for truths in reporter.track(list(_blocks(frames, wanted)), "Overlaps"):
+    for truths in reporter.track(list(_blocks(frames, truth_mask)), "Overlaps"):
         pairs = _all_pairs(frames, truths)
         image = _image_iou(frames.detections.bbox[pairs.detection], frames.truth.bbox[pairs.truth])
         bev, solid = _ground_iou(detection_boxes[pairs.detection], truth_boxes[pairs.truth])
@@ -94,9 +96,9 @@ def dont_care_shares(frames: Frames) -> _Doubles:
     return shares
 
 
-def _blocks(frames: Frames, wanted: NDArray[np.bool_]) -> Iterator[_Indices]:
+def _blocks(frames: Frames, truth_mask: NDArray[np.bool_]) -> Iterator[_Indices]:
     """Yield the wanted ground truth in blocks with a limited number of pairs."""
-    truths = np.flatnonzero(wanted)
+    truths = np.flatnonzero(truth_mask)
     pairs = np.cumsum(np.diff(frames.detection_starts)[frames.truth_frames[truths]])
     cuts = np.flatnonzero(np.diff(pairs // _BLOCK_PAIRS)) + 1
     yield from np.split(truths, cuts)

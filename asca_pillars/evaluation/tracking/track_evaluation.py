@@ -5,7 +5,7 @@ from asca_pillars.base.system import describe_environment
 from asca_pillars.data.boxes.box_split import BoxSplit
 from asca_pillars.data.open_split import open_split
 from asca_pillars.evaluation.arguments import Evaluation, EvaluationTask
-from asca_pillars.evaluation.report_files import claim, write_report
+from asca_pillars.evaluation.report_files import check_output_folder, write_report
 from asca_pillars.evaluation.report_page import ReportPage
 from asca_pillars.evaluation.tracking.tracking_report import (
     tracking_json,
@@ -26,7 +26,7 @@ def evaluate_tracks(task: EvaluationTask) -> Evaluation:
     labels = open_split(data, split)
     if not isinstance(labels, BoxSplit):
         raise ConfigError(f"--protocol tracking: {data} has no identities; give sequences of asca simulate --sequences")
-    claim("tracking", task.out, task.json, predictions, (data,))
+    check_output_folder("tracking", task.out, task.json, predictions, (data,))
     about = {"data": str(data), "split": split, "predictions": str(predictions), "environment": describe_environment()}
     report = tracking_report(labels, predictions, f"{predictions} against {data}, {split}", about)
     page = ReportPage(report.subject, tracking_tables(report), tracking_notes(report))

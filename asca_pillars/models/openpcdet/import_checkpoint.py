@@ -17,10 +17,10 @@ from asca_pillars.config.pv_rcnn import PvRcnnModel
 from asca_pillars.config.tree import Config
 from asca_pillars.models.build import build_model
 from asca_pillars.models.checkpoint_file import read_failure, read_plain
-from asca_pillars.models.openpcdet.links import Link, convert_state
-from asca_pillars.models.openpcdet.mmdetection3d_links import FIRST_LINEAR, FUSION, mmdetection3d_links
-from asca_pillars.models.openpcdet.pointpillars_links import pointpillars_links
-from asca_pillars.models.openpcdet.pv_rcnn_links import FIRST_CONVOLUTION, pv_rcnn_links
+from asca_pillars.models.openpcdet.key_mapping import KeyMapping, convert_state
+from asca_pillars.models.openpcdet.mmdetection3d_keys import FIRST_LINEAR, FUSION, mmdetection3d_keys
+from asca_pillars.models.openpcdet.pointpillars_keys import pointpillars_keys
+from asca_pillars.models.openpcdet.pv_rcnn_keys import FIRST_CONVOLUTION, pv_rcnn_keys
 
 CONFIG_OF = {
     "vfe.pfn_layers.0.linear.weight": "openpcdet_pointpillars_kitti",
@@ -46,7 +46,7 @@ class ForeignWeights(NamedTuple):
     classes: tuple[str, ...] = ()
     """Names of the classes in their order, if the file has them."""
     legacy: bool = True
-    """Flag of mmdetection3d's encoder, see `encoder_links`; true unless the configuration in the file denies it."""
+    """Flag of mmdetection3d's encoder, see `encoder_keys`; true unless the configuration in the file denies it."""
 
 
 def read_foreign(path: str | Path) -> ForeignWeights:
@@ -142,14 +142,14 @@ def write_imported(weights: ForeignWeights, config: Config, out: str | Path) -> 
             "give a YAML with --config that has its classes in its order"
         )
     prefix = "" if isinstance(model, PillarModel) else "network."
-    wanted = {name.removeprefix(prefix): value for name, value in build_model(model).state_dict().items()}
-    links = _links(weights, model, wanted)
-    linked = {link.target for link in links}
-    if more := [name for name in wanted if name not in linked and not name.endswith("num_batches_tracked")]:
+    our_state = {name.removeprefix(prefix): value for name, value in build_model(model).state_dict().items()}
+    key_mappings = _key_mappings(weights, model, our_state)
+    linked = {mapping.target for mapping in key_mappings}
+    if more := [name for name in our_state if name not in linked and not name.endswith("num_batches_tracked")]:
         raise ConfigError(
             f"--config: {weights.library}'s model has no {more[0]}; switch off what {config.name} adds to it"
         )
-    converted = convert_state(weights.state, links, wanted, str(weights.path))
+    converted = convert_state(weights.state, key_mappings, our_state, str(weights.path))
     content = {
         "hyper_parameters": {"config": to_dict(config)},
         "global_step": weights.steps,
@@ -160,12 +160,14 @@ def write_imported(weights: ForeignWeights, config: Config, out: str | Path) -> 
     return len(weights.state)
 
 
-def _links(weights: ForeignWeights, model: PillarModel | PvRcnnModel, wanted: Mapping[str, Tensor]) -> list[Link]:
+def _key_mappings(
+    weights: ForeignWeights, model: PillarModel | PvRcnnModel, our_state: Mapping[str, Tensor]
+) -> list[KeyMapping]:
     if weights.library == "mmdetection3d":
-        return list(mmdetection3d_links(model, weights.state, wanted, legacy=weights.legacy))
+        return list(mmdetection3d_keys(model, weights.state, our_state, legacy=weights.legacy))
     if isinstance(model, PillarModel):
-        return list(pointpillars_links(model, weights.state))
-    return list(pv_rcnn_links(model, weights.state, wanted))
+        return list(pointpillars_keys(model, weights.state))
+    return list(pv_rcnn_keys(model, weights.state, our_state))
 
 
 class _Omitted:

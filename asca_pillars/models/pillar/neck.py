@@ -41,10 +41,10 @@ class SparseRPNNeck(MapBackbone):
         # A tap's channels lie side by side in memory, as gathered rows do: products read the weights without a copy.
         self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
-    def forward(self, pillars: Tensor, tables: NeckRulebooks[Tensor]) -> Tensor:  # type: ignore[override]
+    def forward(self, pillars: Tensor, rulebooks: NeckRulebooks[Tensor]) -> Tensor:  # type: ignore[override]
         """Apply the neck: unitless features of pillars (P, C) -> (M, out_channels) at M active head cells."""
         maps = []
-        for block, deblock, level in zip(self.blocks, self.deblocks, tables.levels, strict=True):
+        for block, deblock, level in zip(self.blocks, self.deblocks, rulebooks.levels, strict=True):
             for number, (convolution, norm) in enumerate(block_layers(block)):
                 table, back = (
                     (level.strided, level.strided_back),
@@ -55,10 +55,10 @@ class SparseRPNNeck(MapBackbone):
             maps.append(_upsampled(deblock, pillars, level.places))
         return torch.cat(maps, dim=1)
 
-    def forward_dense(self, canvas: Tensor, tables: NeckRulebooks[Tensor]) -> Tensor:
+    def forward_dense(self, canvas: Tensor, rulebooks: NeckRulebooks[Tensor]) -> Tensor:
         """Compute `forward` by dense convolutions with masks: pseudo-image (B, C, ny, nx) -> (M, out_channels)."""
         maps = []
-        for block, deblock, level in zip(self.blocks, self.deblocks, tables.levels, strict=True):
+        for block, deblock, level in zip(self.blocks, self.deblocks, rulebooks.levels, strict=True):
             for number, (convolution, norm) in enumerate(block_layers(block)):
                 everywhere = convolution(canvas).permute(0, 2, 3, 1)  # (B, h, w, outputs)
                 cells = (level.cells if number else level.strided_cells).long()

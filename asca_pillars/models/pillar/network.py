@@ -41,7 +41,7 @@ class PillarDetector(Trainable):
         spec: grid, limits and classes that its parts were made for.
         loss_weights: weights of the loss terms.
         encode: points of pillars to pillar features (section 3.2).
-        neck: pseudo-image, or pillars and tables, to features (section 3.3).
+        neck: pseudo-image, or pillars and rulebooks, to features (section 3.3).
         head: features to head maps.
     """
 

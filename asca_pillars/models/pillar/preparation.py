@@ -24,11 +24,11 @@ class Placement(NamedTuple):
 
     Attributes:
         pooling: of a pooled map; None where pillars and cells are the same.
-        tables: of a sparse neck; None for a dense one.
+        rulebooks: of a sparse neck; None for a dense one.
     """
 
     pooling: MapCells[NDArray[np.int64]] | None
-    tables: NeckRulebooks[NDArray[np.int32]] | None
+    rulebooks: NeckRulebooks[NDArray[np.int32]] | None
 
 
 class TargetedPillars(NamedTuple):
@@ -82,7 +82,7 @@ class PillarPreparation:
 
     Args:
         spec: grid, limits and classes.
-        active_cells: of a sparse neck, whose tables are built here; None for a dense one.
+        active_cells: of a sparse neck, whose rulebooks are built here; None for a dense one.
         assigner: what matches anchors with boxes.
     """
 
@@ -127,7 +127,7 @@ def batch_pillars(frames: Sequence[Pillars], placements: Sequence[Placement] = (
     frame_pillars = [len(frame.cells) for frame in frames]
     starts = np.concatenate([[0], np.cumsum(frame_pillars)[:-1]]).astype(np.int64)
     poolings = [each.pooling for each in placements if each.pooling is not None]
-    tables = [each.tables for each in placements if each.tables is not None]
+    rulebooks = [each.rulebooks for each in placements if each.rulebooks is not None]
     frame_cells = [len(each.cells) for each in poolings] or frame_pillars
     return PillarBatch(
         features=torch.from_numpy(np.concatenate([frame.features for frame in frames])),
@@ -137,19 +137,19 @@ def batch_pillars(frames: Sequence[Pillars], placements: Sequence[Placement] = (
         point_counts=torch.from_numpy(np.concatenate([frame.point_counts for frame in frames])),
         cells=torch.from_numpy(np.concatenate([frame.cells for frame in frames])),
         frame_pillars=frame_pillars,
-        neck=_batch_rulebooks(tables, frame_cells),
+        neck=_batch_rulebooks(rulebooks, frame_cells),
         pooling=_batch_poolings(poolings, starts),
         frame_cells=frame_cells,
     )
 
 
 def _batch_rulebooks(
-    tables: Sequence[NeckRulebooks[NDArray[np.int32]]], frame_cells: Sequence[int]
+    rulebooks: Sequence[NeckRulebooks[NDArray[np.int32]]], frame_cells: Sequence[int]
 ) -> NeckRulebooks[Tensor] | None:
-    if not tables:
+    if not rulebooks:
         return None
     batch: NeckRulebooks[Tensor] = tree_map_only(
-        np.ndarray, torch.from_numpy, stack_neck_rulebooks(tables, frame_cells)
+        np.ndarray, torch.from_numpy, stack_neck_rulebooks(rulebooks, frame_cells)
     )
     return batch
 

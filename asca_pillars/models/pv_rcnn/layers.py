@@ -49,7 +49,7 @@ class DualAttention(nn.Module):
 
     def forward(self, features: Tensor) -> Tensor:
         """Apply the attention: unitless (B, C, H, W) -> the same shape."""
-        attended = self.by_place(self.by_channel(features))
+        attended = self.by_location(self.by_channel(features))
         return features + _RESIDUAL_WEIGHT * attended if self.residual else attended
 
     def by_channel(self, features: Tensor) -> Tensor:
@@ -60,7 +60,7 @@ class DualAttention(nn.Module):
         weights = torch.sigmoid(self.channel_norm(self.channel_out(pooled)))
         return features * weights[:, :, None, None]
 
-    def by_place(self, features: Tensor) -> Tensor:
+    def by_location(self, features: Tensor) -> Tensor:
         """Return eq. (3) and (4): a weight in (0, 1) for each place of unitless (B, C, H, W)."""
         values = self.place_value(features)  # (B, C / 2, H, W)
         shares = torch.softmax(self.place_query(features).mean(dim=(2, 3)), dim=1)  # (B, C / 2)
@@ -211,7 +211,7 @@ class PvRcnn(nn.Module):
         if not self.settings.deformed:
             features, logits = self.encode(rows, batch.keypoints, beside, batch.ball_indices)
             return features, logits
-        places = self.deformed_places(batch, levels)
+        places = self.deformed_positions(batch, levels)
         if self.settings.deform == "authors_frozen":
             places = {name: [place.detach() for place in each] for name, each in places.items()}
             rows = [
@@ -222,7 +222,7 @@ class PvRcnn(nn.Module):
         features, logits = self.encode(rows, batch.keypoints, beside, indices, centers)
         return features, logits
 
-    def deformed_places(self, batch: VoxelBatch[Tensor], levels: Sequence[Tensor]) -> dict[str, list[Tensor]]:
+    def deformed_positions(self, batch: VoxelBatch[Tensor], levels: Sequence[Tensor]) -> dict[str, list[Tensor]]:
         """Return shifted positions (K, 3), metres, of keypoints for each deformed source: one, or one per radius."""
         places, first = {}, 0
         for number, each in enumerate(self.settings.sources):

@@ -82,13 +82,13 @@ class PvRcnnDetector(Trainable):
         """Return loss terms of the trained parts by name, see `detection_loss` and `refine_loss`, all of weight 1."""
         device = outputs.found.confidence.device
         first = {} if self._kept else detection_loss(outputs.maps, batch.anchors, self.loss_weights)._asdict()
-        targets, learnt = _roi_targets(outputs.proposals, batch)
-        counted = torch.from_numpy(learnt).to(device)
+        targets, loss_mask = _roi_targets(outputs.proposals, batch)
+        counted = torch.from_numpy(loss_mask).to(device)
         found = outputs.found
-        confidence, positive, residuals, sizes = (torch.from_numpy(part[learnt]).to(device) for part in targets)
-        wanted = RefineTargets(confidence, positive, residuals, sizes, batch.keypoint_states)
+        confidence, positive, residuals, sizes = (torch.from_numpy(part[loss_mask]).to(device) for part in targets)
+        targets_in_loss = RefineTargets(confidence, positive, residuals, sizes, batch.keypoint_states)
         kept = Refinements(found.confidence[counted], found.residuals[counted], found.keypoint_logits)
-        terms = first | refine_loss(kept, wanted)._asdict()
+        terms = first | refine_loss(kept, targets_in_loss)._asdict()
         if self.model.box_loss == "va":
             boxes = (kept.residuals[positive].float(), residuals[positive], sizes[positive])
             distance_iou = distance_iou_loss(*boxes).sum() / max(len(boxes[0]), 1)
@@ -169,13 +169,13 @@ def _roi_targets(
     proposals: Sequence[Detections], batch: LabeledVoxels
 ) -> tuple[tuple[NDArray[np.generic], ...], NDArray[np.bool_]]:
     """Return confidence, positive, residuals, sizes (R, ...) of all proposals, and a mask (R,) of those sampled."""
-    parts, learnt = [], []
+    parts, loss_mask = [], []
     for frame, boxes, labels in zip(proposals, batch.boxes, batch.labels, strict=True):
         overlaps = match_proposals(frame, boxes, labels)
         targets = roi_targets(frame, boxes, overlaps, np.arange(len(frame)))
         parts.append((targets.confidence, targets.positive, targets.residuals, frame.boxes[:, 3:6]))
-        learnt.append(~overlaps.ignored)
-    return tuple(np.concatenate(part) for part in zip(*parts, strict=True)), np.concatenate(learnt)
+        loss_mask.append(~overlaps.ignored)
+    return tuple(np.concatenate(part) for part in zip(*parts, strict=True)), np.concatenate(loss_mask)
 
 
 def build_pv_rcnn_detector(model: PvRcnnModel) -> PvRcnnDetector:

@@ -23,7 +23,7 @@ from asca_pillars.models.checkpoint_file import read_checkpoint, weights_sha256
 from asca_pillars.models.pillar.network import build_pillar_detector
 from asca_pillars.models.pillar.preparation import batch_pillars
 from asca_pillars.ops.pillar.spec import PillarSpec
-from asca_pillars.ops.two_stage.first_stage import FirstPass, FirstStage, require_pillar_kind
+from asca_pillars.ops.two_stage.first_stage import FirstStage, FirstStageOutputs, require_pillar_kind
 
 _MANIFEST = "bundle.json"
 
@@ -56,7 +56,7 @@ class TorchFirstStage:
         """Pickle as its source, from which the other process reads it."""
         return open_first_stage, (self._source,)
 
-    def __call__(self, points: NDArray[np.float32]) -> FirstPass:
+    def __call__(self, points: NDArray[np.float32]) -> FirstStageOutputs:
         """See `FirstStage`."""
         network, pillars = self._network, self.spec.pillarize(points)
         batch = batch_pillars([pillars], [network.preparation.place(pillars)])
@@ -65,9 +65,9 @@ class TorchFirstStage:
             maps = network.read_head(features, batch)
         if batch.neck is not None:
             rows = HeadMaps(*(part.numpy() for part in maps))
-            return FirstPass(rows, features.numpy(), batch.neck.head_cells.int().numpy())
+            return FirstStageOutputs(rows, features.numpy(), batch.neck.head_cells.int().numpy())
         channels_last = np.ascontiguousarray(features[0].permute(1, 2, 0).numpy())
-        return FirstPass(HeadMaps(*(part[0].numpy() for part in maps)), channels_last)
+        return FirstStageOutputs(HeadMaps(*(part[0].numpy() for part in maps)), channels_last)
 
 
 def open_first_stage(source: str) -> FirstStage:

@@ -50,15 +50,15 @@ def refine_loss(found: Refinements, targets: RefineTargets) -> RefineTerms:
     """Compute BCE per proposal, smooth L1 and corners per positive proposal, focal loss per positive keypoint."""
     confidence = F.binary_cross_entropy_with_logits(found.confidence.float(), targets.confidence, reduction="sum")
     positive = targets.positive
-    residuals, wanted = found.residuals.float()[positive], targets.residuals[positive]
-    positives = max(len(wanted), 1)
-    corners = corner_loss(residuals, wanted, targets.sizes[positive])
+    residuals, target = found.residuals.float()[positive], targets.residuals[positive]
+    positives = max(len(target), 1)
+    corners = corner_loss(residuals, target, targets.sizes[positive])
     states = targets.keypoint_states
     keypoints = focal_loss(found.keypoint_logits.float(), states, _FOCAL_ALPHA, _FOCAL_GAMMA)
     in_objects = max(int((states == 1).sum()), round(_LEAST_POSITIVE * len(states)), 1)
     return RefineTerms(
         confidence / max(len(positive), 1),
-        F.smooth_l1_loss(residuals, wanted, beta=_RESIDUAL_BETA, reduction="sum") / positives,
+        F.smooth_l1_loss(residuals, target, beta=_RESIDUAL_BETA, reduction="sum") / positives,
         corners.sum() / positives,
         keypoints / in_objects,
     )
@@ -70,11 +70,11 @@ def corner_loss(residuals: Tensor, targets: Tensor, sizes: Tensor) -> Tensor:
     Corners are in the frames of the proposals, which have these sizes. Each is compared with the nearer one of the
     target box and of the same box turned by half a circle.
     """
-    found, wanted = corners_in_frames(residuals, sizes), corners_in_frames(targets, sizes)
+    found, target = corners_in_frames(residuals, sizes), corners_in_frames(targets, sizes)
     half_turn = torch.zeros_like(targets)
     half_turn[:, 6] = math.pi
     turned = corners_in_frames(targets + half_turn, sizes)
-    way_m = torch.minimum((found - wanted).norm(dim=2), (found - turned).norm(dim=2))  # (R, 8)
+    way_m = torch.minimum((found - target).norm(dim=2), (found - turned).norm(dim=2))  # (R, 8)
     return F.smooth_l1_loss(way_m, torch.zeros_like(way_m), beta=_CORNER_BETA, reduction="none").mean(dim=1)
 
 
@@ -83,15 +83,15 @@ def distance_iou_loss(residuals: Tensor, targets: Tensor, sizes: Tensor) -> Tens
 
     Both boxes as rectangles along the axes of their proposals, which have these sizes: (R, 7), (R, 7), (R, 3) -> (R,).
     """
-    (center, half), (wanted, wanted_half) = (_boxes_in_frames(each, sizes) for each in (residuals, targets))
+    (center, half), (target, target_half) = (_boxes_in_frames(each, sizes) for each in (residuals, targets))
     ends = [
-        (at[:, :2] - reach[:, :2], at[:, :2] + reach[:, :2]) for at, reach in ((center, half), (wanted, wanted_half))
+        (at[:, :2] - reach[:, :2], at[:, :2] + reach[:, :2]) for at, reach in ((center, half), (target, target_half))
     ]
     (low, high), (wanted_low, wanted_high) = ends
     shared = (torch.minimum(high, wanted_high) - torch.maximum(low, wanted_low)).clamp(min=0).prod(dim=1)
-    union = 4 * (half[:, :2].prod(dim=1) + wanted_half[:, :2].prod(dim=1)) - shared
+    union = 4 * (half[:, :2].prod(dim=1) + target_half[:, :2].prod(dim=1)) - shared
     around = torch.maximum(high, wanted_high) - torch.minimum(low, wanted_low)
-    apart = (center - wanted)[:, :2].square().sum(dim=1)
+    apart = (center - target)[:, :2].square().sum(dim=1)
     return 1 - shared / union + apart / around.square().sum(dim=1)
 
 

@@ -33,7 +33,7 @@ from asca_pillars.models.two_stage.preparation import (
 )
 from asca_pillars.models.two_stage.sets import SetAbstraction
 from asca_pillars.ops.two_stage.decode import Scores, refined_detections, refined_scores, reported_frames
-from asca_pillars.ops.two_stage.first_stage import Proposed
+from asca_pillars.ops.two_stage.first_stage import SecondStageInputs
 from asca_pillars.ops.two_stage.prepare import ROI_FEATURES, RefineSettings, refine_scan
 
 POINT_CHANNELS = 1  # reflectance
@@ -81,16 +81,16 @@ class RefineDetector(Trainable):
 
     def loss(self, outputs: RefineOutputs, batch: LabeledProposals) -> Mapping[str, Tensor]:
         """Return the terms by name, see `refine_loss`; proposals of IGNORED boxes are left out."""
-        found, targets, learnt = outputs.found, batch.targets, batch.learnt
-        counted = Refinements(found.confidence[learnt], found.residuals[learnt], found.keypoint_logits)
-        wanted = RefineTargets(
-            targets.confidence[learnt],
-            targets.positive[learnt],
-            targets.residuals[learnt],
-            targets.sizes[learnt],
+        found, targets, loss_mask = outputs.found, batch.targets, batch.loss_mask
+        counted = Refinements(found.confidence[loss_mask], found.residuals[loss_mask], found.keypoint_logits)
+        targets_in_loss = RefineTargets(
+            targets.confidence[loss_mask],
+            targets.positive[loss_mask],
+            targets.residuals[loss_mask],
+            targets.sizes[loss_mask],
             targets.keypoint_states,
         )
-        return refine_loss(counted, wanted)._asdict()
+        return refine_loss(counted, targets_in_loss)._asdict()
 
     def detect(self, outputs: RefineOutputs, spec: DetectorSpec) -> list[Detections]:
         """Return refined boxes of each frame, with the thresholds of `spec`."""
@@ -142,7 +142,7 @@ def build_refiner(bev_channels: int, classes: int, refine: RefineConfig) -> Pill
 def refine(
     network: PillarRefiner,
     points: NDArray[np.float32],
-    proposed: Proposed,
+    proposed: SecondStageInputs,
     settings: RefineSettings,
     post: PostProcess,
     scores: Scores,
@@ -160,7 +160,7 @@ def refine(
 
 
 def refine_logits(
-    network: PillarRefiner, points: NDArray[np.float32], proposed: Proposed, settings: RefineSettings
+    network: PillarRefiner, points: NDArray[np.float32], proposed: SecondStageInputs, settings: RefineSettings
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return confidence logits (R,) and residuals (R, 7) of the proposals of one scan, see `refine`."""
     if not len(proposed.proposals):

@@ -22,7 +22,7 @@ from asca_pillars.models.two_stage.first_stage import open_first_stage, with_fir
 from asca_pillars.models.two_stage.layers import RefineInputs
 from asca_pillars.models.two_stage.loss import RefineTargets
 from asca_pillars.models.two_stage.proposal_cache import ProposalCache, ProposalFiles
-from asca_pillars.ops.two_stage.first_stage import FirstStage, FirstStageSettings, Proposed, propose_on
+from asca_pillars.ops.two_stage.first_stage import FirstStage, FirstStageSettings, SecondStageInputs, run_first_stage
 from asca_pillars.ops.two_stage.prepare import RefineScan, RefineSettings, refine_scan
 from asca_pillars.ops.two_stage.rois import (
     Overlaps,
@@ -54,7 +54,7 @@ class RefineBatch(NamedTuple):
 
 def sample_of(
     frame: LabeledFrame,
-    proposed: Proposed,
+    proposed: SecondStageInputs,
     overlaps: Overlaps,
     rows: NDArray[np.int64],
     settings: RefineSettings,
@@ -123,7 +123,7 @@ class PreparedRefinement(NamedTuple):
     sample: RefineSample
     proposals: Detections
     """Proposals of the sample, in its order."""
-    learnt: NDArray[np.bool_]
+    loss_mask: NDArray[np.bool_]
     """(S,) those that the loss counts."""
 
 
@@ -132,7 +132,7 @@ class LabeledProposals(NamedTuple):
 
     inputs: RefineInputs
     targets: RefineTargets
-    learnt: Tensor
+    loss_mask: Tensor
     """(R,) bool, the proposals that the loss counts."""
     proposals: tuple[Detections, ...]
     """Proposals of each frame."""
@@ -146,7 +146,7 @@ class LabeledProposals(NamedTuple):
 class ProposalSource(Protocol):
     """Source of a frame's proposals."""
 
-    def __call__(self, frame: LabeledFrame) -> Proposed:
+    def __call__(self, frame: LabeledFrame) -> SecondStageInputs:
         """Return the first-stage results of the frame in its current, perhaps augmented, state."""
         ...
 
@@ -157,7 +157,7 @@ class CachedProposals:
 
     files: ProposalFiles
 
-    def __call__(self, frame: LabeledFrame) -> Proposed:
+    def __call__(self, frame: LabeledFrame) -> SecondStageInputs:
         """See `ProposalSource`."""
         return move_proposed(self.files.read(frame.frame_id), frame.motion)
 
@@ -169,9 +169,9 @@ class LiveProposals:
     stage: FirstStage
     settings: FirstStageSettings
 
-    def __call__(self, frame: LabeledFrame) -> Proposed:
+    def __call__(self, frame: LabeledFrame) -> SecondStageInputs:
         """See `ProposalSource`."""
-        return propose_on(self.stage, frame.points, self.settings)
+        return run_first_stage(self.stage, frame.points, self.settings)
 
 
 @dataclass(frozen=True)
@@ -195,8 +195,8 @@ class RefinePreparation:
     def collate(self, frames: Sequence[PreparedRefinement]) -> LabeledProposals:
         """Collate frames into one batch."""
         batch = collate_samples([frame.sample for frame in frames])
-        learnt = torch.from_numpy(np.concatenate([frame.learnt for frame in frames]))
-        return LabeledProposals(*batch, learnt, tuple(frame.proposals for frame in frames))
+        loss_mask = torch.from_numpy(np.concatenate([frame.loss_mask for frame in frames]))
+        return LabeledProposals(*batch, loss_mask, tuple(frame.proposals for frame in frames))
 
 
 def cached_preparation(model: RefineModel, split: LabeledSplit, data: DataConfig) -> RefinePreparation:
@@ -224,7 +224,7 @@ def live_preparation(model: RefineModel) -> RefinePreparation:
     return RefinePreparation(model.refine, LiveProposals(open_first_stage(model.first_stage), model.refine.seen))
 
 
-def move_proposed(proposed: Proposed, motion: Motion) -> Proposed:
+def move_proposed(proposed: SecondStageInputs, motion: Motion) -> SecondStageInputs:
     """Move proposals and keypoints with the augmented scene; map features of keypoints stay."""
     proposals = proposed.proposals
     moved = LabeledFrame("", proposed.keypoints.copy(), proposals.boxes.copy(), proposals.labels)

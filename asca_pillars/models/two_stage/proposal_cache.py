@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 from rich.console import Console
 
 from asca_pillars.base.errors import DatasetError
-from asca_pillars.base.processes import in_processes
+from asca_pillars.base.processes import map_in_processes
 from asca_pillars.base.schema import to_dict
-from asca_pillars.data.insertion.prepared import require_writable, writing
+from asca_pillars.data.insertion.prepared import require_writable, writable_atomic_path
 from asca_pillars.data.labeled_split import LabeledSplit
 from asca_pillars.detection.detections import Detections
-from asca_pillars.ops.two_stage.first_stage import FirstStage, FirstStageSettings, Proposed, propose_on
+from asca_pillars.ops.two_stage.first_stage import FirstStage, FirstStageSettings, SecondStageInputs, run_first_stage
 
 _FORMAT = 3  # format of the files; with another number, old ones are not read
 
@@ -29,7 +29,7 @@ class ProposalFiles:
     folder: Path
     class_names: tuple[str, ...]
 
-    def read(self, frame_id: str) -> Proposed:
+    def read(self, frame_id: str) -> SecondStageInputs:
         """Read the first-stage results of a frame.
 
         Raises:
@@ -40,7 +40,7 @@ class ProposalFiles:
             # Opened here: NumPy leaves a file that it cannot read open.
             with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
                 detections = Detections(arrays["boxes"], arrays["scores"], arrays["labels"], self.class_names)
-                return Proposed(detections, arrays["keypoints"], arrays["bev"].astype(np.float32))
+                return SecondStageInputs(detections, arrays["keypoints"], arrays["bev"].astype(np.float32))
         except FileNotFoundError:
             raise DatasetError(f"{path}: no proposals of this frame; compute them first") from None
         except (OSError, ValueError, KeyError, EOFError, BadZipFile) as error:
@@ -87,7 +87,7 @@ class ProposalCache:
         if todo:
             require_writable(self.prepared)
         propose = partial(_propose, self.files, split, self.stage, self.settings, self.camera_view)
-        for _ in in_processes(propose, todo, workers, "Proposing", progress=console is not None, console=console):
+        for _ in map_in_processes(propose, todo, workers, "Proposing", progress=console is not None, console=console):
             pass
 
     def _is_current(self, split: LabeledSplit, frame_id: str) -> bool:
@@ -109,8 +109,8 @@ def _propose(
 ) -> None:
     stamp = _stamp(split, frame_id)  # before the scan is read: one that changes meanwhile is read again
     points = split.points(frame_id, camera_view=camera_view)
-    found = propose_on(stage, points[np.isfinite(points).all(axis=1)], settings)
-    with writing(files.path(frame_id)) as temporary, temporary.open("wb") as file:
+    found = run_first_stage(stage, points[np.isfinite(points).all(axis=1)], settings)
+    with writable_atomic_path(files.path(frame_id)) as temporary, temporary.open("wb") as file:
         np.savez(file, allow_pickle=False, stamp=stamp, **_arrays(found))
 
 
@@ -122,7 +122,7 @@ def _stamp(split: LabeledSplit, frame_id: str) -> NDArray[np.int64]:
         return np.zeros(0, np.int64)
 
 
-def _arrays(found: Proposed) -> dict[str, NDArray[np.generic]]:
+def _arrays(found: SecondStageInputs) -> dict[str, NDArray[np.generic]]:
     proposals = found.proposals
     return {
         "boxes": proposals.boxes,

@@ -9,7 +9,7 @@ import numpy as np
 from numba import types
 from numpy.typing import NDArray
 
-from asca_pillars.base.compiling import compiled, given, inner, written
+from asca_pillars.base.compiling import compiled, in_array, inner, out_array
 from asca_pillars.ops.pillar.grid import PillarGrid
 
 _Floats = NDArray[np.float32]
@@ -43,8 +43,8 @@ def _interval(value: float, edges: _Floats, per_m: float) -> Any:
 
 
 @compiled(
-    *(given(types.float32, 2), given(types.float32, 2), given(types.float32), given(types.int64)),
-    *(given(types.float32), *(written(types.uint32) for _ in range(6))),
+    *(in_array(types.float32, 2), in_array(types.float32, 2), in_array(types.float32), in_array(types.int64)),
+    *(in_array(types.float32), *(out_array(types.uint32) for _ in range(6))),
 )
 def _sort_points(
     points: _Floats,
@@ -122,9 +122,9 @@ def fill_pillars(
 
 
 @compiled(
-    *(given(types.float32, 2), given(types.uint32), given(types.int64), given(types.int64)),
-    *(given(types.boolean), types.int64, given(types.float32), given(types.float32)),
-    *(written(types.float32, 2), written(types.int64)),
+    *(in_array(types.float32, 2), in_array(types.uint32), in_array(types.int64), in_array(types.int64)),
+    *(in_array(types.boolean), types.int64, in_array(types.float32), in_array(types.float32)),
+    *(out_array(types.float32, 2), out_array(types.int64)),
 )
 def _fill_pillars(
     points: _Floats,

@@ -18,7 +18,7 @@ from typing import Generic, Literal, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from asca_pillars.ops.sparse.rulebooks import CellMap, join, map_convolution, stack_cells, stack_rows
+from asca_pillars.ops.sparse.rulebooks import CellMap, build_kernel_map, map_convolution, stack_cells, stack_rows
 
 MaskRule = Literal["sub", "fine"]
 
@@ -83,12 +83,12 @@ class NeckRulebookBuilder:
             self._outputs[0] = CellMap(shapes[1])
         self._head = CellMap(shapes[1])
         before = [self._pillars, *self._outputs[:-1]]
-        self._strided_maps = [join(STRIDED, *maps) for maps in zip(before, self._strided, strict=True)]
-        self._dilated_maps = [join(SAME, *maps) for maps in zip(self._strided, self._outputs, strict=True)]
-        self._submanifold_maps = [join(SAME, level, level) for level in self._outputs]
+        self._strided_maps = [build_kernel_map(STRIDED, *maps) for maps in zip(before, self._strided, strict=True)]
+        self._dilated_maps = [build_kernel_map(SAME, *maps) for maps in zip(self._strided, self._outputs, strict=True)]
+        self._submanifold_maps = [build_kernel_map(SAME, level, level) for level in self._outputs]
         strides = [map_convolution(1 << level, stride=1 << level) for level in range(LEVELS)]
         self._upsampling_maps = [
-            join(stride, self._head, level) for stride, level in zip(strides, self._outputs, strict=True)
+            build_kernel_map(stride, self._head, level) for stride, level in zip(strides, self._outputs, strict=True)
         ]
 
     def build(self, cells: NDArray[np.int64]) -> NeckRulebooks[NDArray[np.int32]]:
@@ -102,11 +102,11 @@ class NeckRulebookBuilder:
                 self._submanifold_maps[number],
             )
             strided, output = dilated_map.source, dilated_map.target
-            same = submanifold_map.table()
+            same = submanifold_map.rulebook()
             levels.append(
                 LevelRulebooks(
-                    strided=strided_map.table(),
-                    first=same if strided is output else dilated_map.table(),
+                    strided=strided_map.rulebook(),
+                    first=same if strided is output else dilated_map.rulebook(),
                     same=same,
                     strided_back=strided_map.inverse() if self.training else _NO_RULEBOOK,
                     first_back=dilated_map.inverse() if self.training else _NO_RULEBOOK,

@@ -26,7 +26,7 @@ to the mean of the pillar's kept points and to the pillar's center."""
 
 @dataclass(frozen=True)
 class PillarLimits(Strict):
-    """Upper bounds of one scan's input; beyond them an even subset is kept (P and N of the paper), see `evenly`."""
+    """Upper bounds of one scan; beyond them an even subset is kept (P and N of the paper), see `evenly_spaced_mask`."""
 
     max_pillars: int = 12000
     max_points: int = 64
@@ -84,7 +84,7 @@ def pillarize(
     points = np.require(points, np.float32, ["C", "ALIGNED"])
     kernels = load_kernels(KERNELS)
     order, cells, counts = kernels.sort_points(points, grid)
-    kept = evenly(np.arange(len(cells)), len(cells), limits.max_pillars)
+    kept = evenly_spaced_mask(np.arange(len(cells)), len(cells), limits.max_pillars)
     features, pillar_index, point_counts = kernels.fill_pillars(
         points, order, cells, counts, kept, limits.max_points, grid
     )
@@ -103,7 +103,7 @@ def pillarize(
     )
 
 
-def evenly(places: NDArray[np.int64], counts: NDArray[np.int64] | int, most: int) -> NDArray[np.bool_]:
+def evenly_spaced_mask(places: NDArray[np.int64], counts: NDArray[np.int64] | int, most: int) -> NDArray[np.bool_]:
     """Return a mask of the entries kept if a row may keep `most`: positions in the rows, from 0, and the rows' lengths.
 
     Kept entries are evenly spaced along the row: the share that random sampling keeps (paper section 3.2), taken from

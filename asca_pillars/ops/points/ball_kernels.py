@@ -6,7 +6,7 @@ import numpy as np
 from numba import types
 from numpy.typing import NDArray
 
-from asca_pillars.base.compiling import compiled, given, inner, written
+from asca_pillars.base.compiling import compiled, in_array, inner, out_array
 from asca_pillars.ops.points.sampling import Columns, cells_of
 
 _Floats = NDArray[np.float32]
@@ -16,7 +16,7 @@ _Three: TypeAlias = tuple[Any, Any, Any]
 
 _CROWDED = 4  # times the samples stand in the columns around a query: its ball is probably full
 
-_COLUMNS = given(types.int32), given(types.int32), types.int64, types.int64
+_COLUMNS = in_array(types.int32), in_array(types.int32), types.int64, types.int64
 
 
 def ball_query(
@@ -69,16 +69,14 @@ def nearest_in_cubes(
 
 
 @compiled(
-    *(
-        given(types.float32, 2),
-        *_COLUMNS,
-        given(types.float32, 2),
-        given(types.int64, 2),
-        given(types.int32, 2),
-        given(types.int32),
-        types.float32,
-    ),
-    *(types.int64, written(types.float32, 2), written(types.int32, 2)),
+    in_array(types.float32, 2),
+    *_COLUMNS,
+    in_array(types.float32, 2),
+    in_array(types.int64, 2),
+    in_array(types.int32, 2),
+    in_array(types.int32),
+    types.float32,
+    *(types.int64, out_array(types.float32, 2), out_array(types.int32, 2)),
 )
 def _ball_query(
     xyz: _Floats,
@@ -170,8 +168,8 @@ def _kept(i: int, distance: float, nearest: _Three, squared: _Three) -> tuple[_T
 
 
 @compiled(
-    *(given(types.float32, 2), *_COLUMNS, given(types.float32, 2), given(types.int64, 2), types.float32),
-    *(written(types.int32, 2), written(types.float32, 2)),
+    *(in_array(types.float32, 2), *_COLUMNS, in_array(types.float32, 2), in_array(types.int64, 2), types.float32),
+    *(out_array(types.int32, 2), out_array(types.float32, 2)),
 )
 def _three_nearest(
     xyz: _Floats,
@@ -210,9 +208,13 @@ def _three_nearest(
 
 
 @compiled(
-    *(given(types.float32, 2), given(types.int32), given(types.int32), types.int64, given(types.float32, 2)),
-    *(given(types.int64, 2), given(types.int64, 2), given(types.float32, 2), types.float32),
-    *(written(types.int32), written(types.int32, 3)),
+    in_array(types.float32, 2),
+    in_array(types.int32),
+    in_array(types.int32),
+    types.int64,
+    in_array(types.float32, 2),
+    *(in_array(types.int64, 2), in_array(types.int64, 2), in_array(types.float32, 2), types.float32),
+    *(out_array(types.int32), out_array(types.int32, 3)),
 )
 def _nearest_in_cubes(
     xyz: _Floats,

@@ -7,7 +7,7 @@ import numpy as np
 from numba import types
 from numpy.typing import NDArray
 
-from asca_pillars.base.compiling import compiled, given, inner, written
+from asca_pillars.base.compiling import compiled, in_array, inner, out_array
 from asca_pillars.ops.points.sampling import Columns
 
 _Floats = NDArray[np.float32]
@@ -18,8 +18,8 @@ _MAX_CELLS = 256  # along each axis, of those that tell which points are near ci
 _NO_CIRCLE, _COVERED = -1, -2
 
 _COLUMNS = (
-    given(types.int32),
-    given(types.int32),
+    in_array(types.int32),
+    in_array(types.int32),
     types.float32,
     types.float32,
     types.float32,
@@ -84,8 +84,8 @@ def _column(value: Any, low: Any, per_m: Any) -> int:
 
 
 @compiled(
-    *(given(types.float32, 2), types.float32, types.float32, types.float32, types.int64),
-    *(written(types.int32), written(types.int32), written(types.int32)),
+    *(in_array(types.float32, 2), types.float32, types.float32, types.float32, types.int64),
+    *(out_array(types.int32), out_array(types.int32), out_array(types.int32)),
 )
 def _sort(
     xyz: _Floats,
@@ -113,9 +113,9 @@ def _sort(
 
 
 @compiled(
-    *(given(types.float32, 2), *_COLUMNS),
-    *(written(types.float32, 2), written(types.float32, 2), written(types.float32), written(types.int32)),
-    *(written(types.int32), written(types.int32)),
+    *(in_array(types.float32, 2), *_COLUMNS),
+    *(out_array(types.float32, 2), out_array(types.float32, 2), out_array(types.float32), out_array(types.int32)),
+    *(out_array(types.int32), out_array(types.int32)),
 )
 def _farthest_points(
     xyz: _Floats,
@@ -202,9 +202,9 @@ def _farthest_points(
 
 
 @compiled(
-    *(given(types.float32, 2), given(types.float32, 2), given(types.float32)),
+    *(in_array(types.float32, 2), in_array(types.float32, 2), in_array(types.float32)),
     *(types.float32, types.float32, types.float32, types.float32),
-    *(written(types.int32, 2), written(types.int32, 2), written(types.float32, 2)),
+    *(out_array(types.int32, 2), out_array(types.int32, 2), out_array(types.float32, 2)),
 )
 def _near_circles(
     points: _Floats,
@@ -266,6 +266,6 @@ def _read_map(rows: NDArray[Any], cells: _Integers, weights: _Floats, read: _Flo
                 read[k, channel] += np.float32(rows[cell, channel]) * weight
 
 
-_PLACES = given(types.int32, 2), given(types.float32, 2), written(types.float32, 2)
-_read_floats = compiled(given(types.float32, 2), *_PLACES)(_read_map)
-_read_steps = compiled(given(types.uint8, 2), *_PLACES)(_read_map)
+_PLACES = in_array(types.int32, 2), in_array(types.float32, 2), out_array(types.float32, 2)
+_read_floats = compiled(in_array(types.float32, 2), *_PLACES)(_read_map)
+_read_steps = compiled(in_array(types.uint8, 2), *_PLACES)(_read_map)

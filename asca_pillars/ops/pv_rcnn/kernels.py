@@ -6,7 +6,7 @@ import numpy as np
 from numba import types
 from numpy.typing import NDArray
 
-from asca_pillars.base.compiling import compiled, given, written
+from asca_pillars.base.compiling import compiled, in_array, out_array
 from asca_pillars.ops.sparse.kernels import bits_of, bits_set
 from asca_pillars.ops.sparse.rulebooks import Shape
 
@@ -15,10 +15,10 @@ _Integers = NDArray[np.int64]
 _Masks = NDArray[np.uint64]
 
 _ONE, _SHAPE = np.uint64(1), types.UniTuple(types.int64, 3)
-_EDGES = (*(given(types.float32),) * 3, given(types.int64))
+_EDGES = (*(in_array(types.float32),) * 3, in_array(types.int64))
 
 
-@compiled(given(types.float32, 2), *_EDGES, _SHAPE, written(types.int64))
+@compiled(in_array(types.float32, 2), *_EDGES, _SHAPE, out_array(types.int64))
 def cells_of_points(
     points: _Floats,
     lows_m: _Floats,
@@ -43,8 +43,13 @@ def cells_of_points(
 
 
 @compiled(
-    *(given(types.float32, 2), given(types.int64), types.int64, given(types.uint64), given(types.int32), types.int64),
-    *(written(types.float64, 2), written(types.int64), written(types.float32, 2)),
+    in_array(types.float32, 2),
+    in_array(types.int64),
+    types.int64,
+    in_array(types.uint64),
+    in_array(types.int32),
+    types.int64,
+    *(out_array(types.float64, 2), out_array(types.int64), out_array(types.float32, 2)),
 )
 def sum_points(
     points: _Floats,

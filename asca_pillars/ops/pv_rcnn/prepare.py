@@ -112,7 +112,7 @@ class VoxelSetSettings(GridSettings):
         return tuple(each for each in self.sources if self.deform != "none" and each.source != "points")
 
     @property
-    def nearest_wanted(self) -> bool:
+    def needs_three_nearest(self) -> bool:
         """True if the three nearest voxels of a keypoint are needed."""
         return self.deform == "paper"
 
@@ -195,7 +195,7 @@ def with_neighbors(
         )
         for each, where in zip(settings.sources, positions, strict=True)
     )
-    asked = settings.deformed if settings.nearest_wanted else ()
+    asked = settings.deformed if settings.needs_three_nearest else ()
     nearest = [
         three_nearest(where, keypoints if each in asked else keypoints[:0])
         for each, where in zip(settings.sources, positions, strict=True)

@@ -7,7 +7,7 @@ from typing import Any, Generic, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from asca_pillars.ops.sparse.rulebooks import CellMap, Convolution, Shape, join, stack_rows
+from asca_pillars.ops.sparse.rulebooks import CellMap, Convolution, Shape, build_kernel_map, stack_rows
 
 SUBMANIFOLD = Convolution((3, 3, 3), (1, 1, 1), (1, 1, 1))
 PV_RCNN_STRIDED = (
@@ -64,21 +64,23 @@ class VoxelRulebookBuilder:
         """Map of each level; the caller fills the first one with the voxels."""
         for convolution in strided:
             self.maps.append(CellMap(convolution.output_shape(self.maps[-1].shape)))
-        self._strided_maps = [join(*each) for each in zip(self.strided, self.maps[:-1], self.maps[1:], strict=True)]
-        self._submanifold_maps = [join(SUBMANIFOLD, level, level) for level in self.maps]
+        self._strided_maps = [
+            build_kernel_map(*each) for each in zip(self.strided, self.maps[:-1], self.maps[1:], strict=True)
+        ]
+        self._submanifold_maps = [build_kernel_map(SUBMANIFOLD, level, level) for level in self.maps]
 
     def build(self) -> list[VoxelLevel[NDArray[Any]]]:
         """Build the rulebooks for the active cells of `maps[0]`, level by level."""
         levels = [self._level(0)]
         for number, stride in enumerate(self._strided_maps, start=1):
             stride.target.activate_joined([(stride.source, stride.outputs)])
-            strided = stride.table()
+            strided = stride.rulebook()
             back = stride.inverse() if self.training else _none(strided.shape[1])
             levels.append(self._level(number)._replace(strided=strided, strided_back=back))
         return levels
 
     def _level(self, number: int) -> VoxelLevel[NDArray[Any]]:
-        same = self._submanifold_maps[number].table() if self.submanifold[number] else _none(SUBMANIFOLD.taps)
+        same = self._submanifold_maps[number].rulebook() if self.submanifold[number] else _none(SUBMANIFOLD.taps)
         return VoxelLevel(self.maps[number].cells, same, _none(0), _none(0))
 
 

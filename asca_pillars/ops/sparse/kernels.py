@@ -10,15 +10,15 @@ import numpy as np
 from numba import types
 from numpy.typing import NDArray
 
-from asca_pillars.base.compiling import compiled, given, inner, written
+from asca_pillars.base.compiling import compiled, in_array, inner, out_array
 
 _Integers = NDArray[np.int64]
 _Rows = NDArray[np.int32]
 _Masks = NDArray[np.uint64]
 
 _ONE = np.uint64(1)
-_CELLS, _COLUMNS = given(types.int64), (given(types.uint64), given(types.int32))
-_LINKS = (given(types.int64, 2),) * 3
+_CELLS, _COLUMNS = in_array(types.int64), (in_array(types.uint64), in_array(types.int32))
+_LINKS = (in_array(types.int64, 2),) * 3
 
 
 @inner
@@ -36,7 +36,7 @@ def bits_of(mask: _Masks, start: _Rows, column: np.uint64) -> Any:
     return mask[column] if len(mask) else np.uint64(start[column] >= 0)
 
 
-@compiled(_CELLS, types.int64, written(types.uint64), written(types.int32))
+@compiled(_CELLS, types.int64, out_array(types.uint64), out_array(types.int32))
 def clear_columns(cells: _Integers, nz: int, mask: _Masks, start: _Rows) -> None:
     """Empty the columns (ny * nx,) of these cells, flat indices (N,)."""
     if nz == 1:
@@ -46,7 +46,7 @@ def clear_columns(cells: _Integers, nz: int, mask: _Masks, start: _Rows) -> None
         mask[np.uint64(cells[i]) // np.uint64(nz)] = 0
 
 
-@compiled(_CELLS, types.int64, written(types.uint64), written(types.int32))
+@compiled(_CELLS, types.int64, out_array(types.uint64), out_array(types.int32))
 def enter_cells(cells: _Integers, nz: int, mask: _Masks, start: _Rows) -> None:
     """Enter ascending cells, flat indices (N,), into empty columns (ny * nx,)."""
     if nz == 1:
@@ -95,7 +95,7 @@ def _mark_flat(cells: _Integers, y_links: _Integers, x_links: _Integers, taps: i
     return found
 
 
-@compiled(_CELLS, types.int64, written(types.uint64), written(types.int32))
+@compiled(_CELLS, types.int64, out_array(types.uint64), out_array(types.int32))
 def mark_points(cells: _Integers, nz: int, mask: _Masks, start: _Rows) -> int:
     """Set the bits of the points' cells, flat indices (M,) or -1, and return how many were not set before."""
     found = 0
@@ -106,7 +106,7 @@ def mark_points(cells: _Integers, nz: int, mask: _Masks, start: _Rows) -> int:
     return found
 
 
-@compiled(_CELLS, *_LINKS, types.int64, written(types.uint64), written(types.int32))
+@compiled(_CELLS, *_LINKS, types.int64, out_array(types.uint64), out_array(types.int32))
 def mark_joined(
     cells: _Integers,
     z_links: _Integers,
@@ -150,7 +150,7 @@ def mark_joined(
     return found
 
 
-@compiled(given(types.uint64), written(types.int32), types.int64, written(types.int64))
+@compiled(in_array(types.uint64), out_array(types.int32), types.int64, out_array(types.int64))
 def list_cells(mask: _Masks, start: _Rows, nz: int, cells: _Integers) -> None:
     """List the cells whose bits are set, ascending flat indices (N,), and where each column (ny * nx,) starts.
 
@@ -187,7 +187,7 @@ def _fill_flat(
     missing: np.int32,
     table: _Rows,
 ) -> None:
-    """Compute `fill_table` where both lattices are one cell high and the kernel is square, several times as fast."""
+    """Compute `fill_rulebook` where both lattices are one cell high and the kernel is square, several times as fast."""
     nowhere, width = np.uint64(len(start) - 1), len(x_links)
     row = 0
     for i in range(len(cells)):
@@ -203,8 +203,8 @@ def _fill_flat(
                 entries[np.uint64(ky * taps + kx)] = np.int32(min(np.uint32(start[place]), np.uint32(missing)))
 
 
-@compiled(_CELLS, *_LINKS, types.int64, *_COLUMNS, types.int32, written(types.int32, 2))
-def fill_table(
+@compiled(_CELLS, *_LINKS, types.int64, *_COLUMNS, types.int32, out_array(types.int32, 2))
+def fill_rulebook(
     cells: _Integers,
     z_links: _Integers,
     y_links: _Integers,
@@ -253,7 +253,7 @@ def fill_table(
         first = end
 
 
-@compiled(_CELLS, types.int64, types.int64, given(types.int32), types.int32, types.int64, written(types.int32))
+@compiled(_CELLS, types.int64, types.int64, in_array(types.int32), types.int32, types.int64, out_array(types.int32))
 def fill_places(
     cells: _Integers,
     nx: int,

@@ -1,4 +1,4 @@
-"""Rulebooks of sparse convolutions: geometry of a convolution, active cells of a lattice, links between lattices.
+"""Rulebooks of sparse convolutions: geometry of a convolution, active cells of a lattice, kernel maps between lattices.
 
 A lattice is made of columns: along z a cell is one bit of its column's 64-bit mask, so that a cell's row is the row at
 which its column starts plus the number of bits set below it. This needs neither hashing nor sorting. Active cells are
@@ -22,10 +22,10 @@ Shape = tuple[int, int, int]
 """Cells along z, y, x; a bird's-eye-view map has one along z."""
 
 
-class Links(NamedTuple):
+class AxisKernelMaps(NamedTuple):
     """Cells of two lattices that each tap of a convolution joins, per axis.
 
-    Tap (kz, ky, kx) joins cell (z, y, x) with (links.z[z, kz], links.y[y, ky], links.x[x, kx]), or with nothing where
+    Tap (kz, ky, kx) joins cell (z, y, x) with (maps.z[z, kz], maps.y[y, ky], maps.x[x, kx]), or with nothing where
     one of them is -1.
     """
 
@@ -66,13 +66,13 @@ class Convolution:
         """Number of taps K of the kernel."""
         return math.prod(self.kernel)
 
-    def inputs(self, outputs: Shape, inputs: Shape) -> Links:
-        """Return the links from an output cell to the input cells that it reads, on lattices of these shapes."""
-        return _links(self, outputs, inputs, backward=False)
+    def inputs(self, outputs: Shape, inputs: Shape) -> AxisKernelMaps:
+        """Return the kernel maps from an output cell to the input cells that it reads, on lattices of these shapes."""
+        return _axis_kernel_maps(self, outputs, inputs, backward=False)
 
-    def outputs(self, inputs: Shape, outputs: Shape) -> Links:
-        """Return the links from an input cell to the output cells that read it."""
-        return _links(self, inputs, outputs, backward=True)
+    def outputs(self, inputs: Shape, outputs: Shape) -> AxisKernelMaps:
+        """Return the kernel maps from an input cell to the output cells that read it."""
+        return _axis_kernel_maps(self, inputs, outputs, backward=True)
 
 
 def map_convolution(kernel: int, stride: int = 1, padding: int = 0) -> Convolution:
@@ -81,7 +81,7 @@ def map_convolution(kernel: int, stride: int = 1, padding: int = 0) -> Convoluti
 
 
 @lru_cache(maxsize=256)  # the same few for every map
-def _links(convolution: Convolution, shape: Shape, other: Shape, *, backward: bool) -> Links:
+def _axis_kernel_maps(convolution: Convolution, shape: Shape, other: Shape, *, backward: bool) -> AxisKernelMaps:
     axes = []
     for axis in range(3):
         taps, stride, padding = np.arange(convolution.kernel[axis]), convolution.stride[axis], convolution.padding[axis]
@@ -90,7 +90,7 @@ def _links(convolution: Convolution, shape: Shape, other: Shape, *, backward: bo
         exists = (rest == 0) & (joined >= 0) & (joined < other[axis])
         axes.append(np.where(exists, joined, -1))
         axes[-1].flags.writeable = False
-    return Links(*axes)
+    return AxisKernelMaps(*axes)
 
 
 KERNELS = "asca_pillars.ops.sparse.kernels"
@@ -151,12 +151,12 @@ class CellMap:
         self._kernels.clear_columns(self.cells, self.shape[0], *self.columns)
         self._list_cells(self._kernels.mark_points(cell_of_point, self.shape[0], *self.columns))
 
-    def activate_joined(self, sources: Sequence[tuple["CellMap", Links]]) -> None:
+    def activate_joined(self, sources: Sequence[tuple["CellMap", AxisKernelMaps]]) -> None:
         """Activate the cells that any tap joins with an active cell of a source; this map must not be a source."""
         self._kernels.clear_columns(self.cells, self.shape[0], *self.columns)
         found = 0
-        for source, links in sources:
-            found += self._kernels.mark_joined(source.cells, *links, self.shape[2], *self.columns)
+        for source, kernel_maps in sources:
+            found += self._kernels.mark_joined(source.cells, *kernel_maps, self.shape[2], *self.columns)
         self._list_cells(found)
 
     def _list_cells(self, count: int) -> None:
@@ -165,14 +165,14 @@ class CellMap:
         self._kernels.list_cells(*self.columns, self.shape[0], cells)
         self.cells = cells[:count]
 
-    def table(self, source: "CellMap", links: Links) -> NDArray[np.int32]:
+    def rulebook(self, source: "CellMap", kernel_maps: AxisKernelMaps) -> NDArray[np.int32]:
         """Return the row in `source` that each tap joins with each active cell: (N, K), len(source) for none.
 
         With `Convolution.inputs` it is the rulebook of the convolution from `source` to this map. With `outputs` it is
         the inverse for the backward pass: the output, on the map `source`, that read each input.
         """
-        table = np.empty((len(self.cells), math.prod(axis.shape[1] for axis in links)), np.int32)
-        self._kernels.fill_table(self.cells, *links, source.shape[2], *source.columns, len(source), table)
+        table = np.empty((len(self.cells), math.prod(axis.shape[1] for axis in kernel_maps)), np.int32)
+        self._kernels.fill_rulebook(self.cells, *kernel_maps, source.shape[2], *source.columns, len(source), table)
         return table
 
     def places(self, parents: "CellMap", halvings: int) -> NDArray[np.int32]:
@@ -189,40 +189,40 @@ class CellMap:
         return places
 
 
-class Join(NamedTuple):
+class KernelMap(NamedTuple):
     """Convolution between two maps; made once for scan after scan."""
 
     source: CellMap
     target: CellMap
-    inputs: Links
-    """Links from the cells of `target` to the cells of `source` that they read."""
-    outputs: Links
-    """Links from the cells of `source` to the cells of `target` that read them."""
+    inputs: AxisKernelMaps
+    """From the cells of `target` to the cells of `source` that they read."""
+    outputs: AxisKernelMaps
+    """From the cells of `source` to the cells of `target` that read them."""
 
-    def table(self) -> NDArray[np.int32]:
-        """Return the rulebook of the convolution: (cells of `target`, K) rows of `source`, see `CellMap.table`."""
-        return self.target.table(self.source, self.inputs)
+    def rulebook(self) -> NDArray[np.int32]:
+        """Return the rulebook of the convolution: (cells of `target`, K) rows of `source`, see `CellMap.rulebook`."""
+        return self.target.rulebook(self.source, self.inputs)
 
     def inverse(self) -> NDArray[np.int32]:
         """Return the rulebook of the backward pass: (cells of `source`, K) rows of `target`."""
-        return self.source.table(self.target, self.outputs)
+        return self.source.rulebook(self.target, self.outputs)
 
 
-def join(convolution: Convolution, source: CellMap, target: CellMap) -> Join:
-    """Return the join of two maps by a convolution."""
+def build_kernel_map(convolution: Convolution, source: CellMap, target: CellMap) -> KernelMap:
+    """Return the kernel map of a convolution between two cell maps."""
     inputs = convolution.inputs(target.shape, source.shape)
-    return Join(source, target, inputs, convolution.outputs(source.shape, target.shape))
+    return KernelMap(source, target, inputs, convolution.outputs(source.shape, target.shape))
 
 
-def stack_rows(tables: Sequence[NDArray[np.int32]], rows: Sequence[int]) -> NDArray[np.int32]:
-    """Stack tables (M_i, ...) of indices into features of `rows[i]` rows -> one into all of them, (sum of M_i, ...).
+def stack_rows(rulebooks: Sequence[NDArray[np.int32]], rows: Sequence[int]) -> NDArray[np.int32]:
+    """Stack rulebooks (M_i, ...) of indices into features of `rows[i]` rows -> one into all of them, (sum of M_i, ...).
 
     The index of a missing row, rows[i], becomes sum(rows).
     """
     starts, total = np.concatenate([[0], np.cumsum(rows)]).astype(np.int32), sum(rows)
     moved = [
         np.where(table == count, np.int32(total), table + start)
-        for table, count, start in zip(tables, rows, starts[:-1], strict=True)
+        for table, count, start in zip(rulebooks, rows, starts[:-1], strict=True)
     ]
     return np.concatenate(moved)
 

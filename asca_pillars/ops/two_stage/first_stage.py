@@ -15,7 +15,7 @@ from asca_pillars.detection.spec import DetectorSpec
 from asca_pillars.ops.points.sampling import bilinear_cells, farthest_points, points_near_boxes, read_map
 
 
-class FirstPass(NamedTuple):
+class FirstStageOutputs(NamedTuple):
     """Outputs of a first stage for one scan."""
 
     maps: HeadMaps[NDArray[np.float32]]
@@ -38,7 +38,7 @@ class FirstStage(Protocol):
     def identity(self) -> str:
         """Identifier of the trained weights, whichever file they come from."""
 
-    def __call__(self, points: NDArray[np.float32]) -> FirstPass:
+    def __call__(self, points: NDArray[np.float32]) -> FirstStageOutputs:
         """Run on one scan (N, 4)."""
 
 
@@ -66,7 +66,7 @@ class FirstStageSettings(Strict):
 
 
 @dataclass(frozen=True)
-class Proposed:
+class SecondStageInputs:
     """First-stage results of one scan that the second stage reads."""
 
     proposals: Detections
@@ -91,22 +91,22 @@ def require_pillar_kind(source: object, kind: str) -> None:
         raise ConfigError(f"{source}: model.kind {kind}; a first stage is of kind pillar")
 
 
-def propose_on(stage: FirstStage, points: NDArray[np.float32], settings: FirstStageSettings) -> Proposed:
+def run_first_stage(stage: FirstStage, points: NDArray[np.float32], settings: FirstStageSettings) -> SecondStageInputs:
     """Run the first stage on the finite points (N, 4) of one scan."""
-    return proposed_from(stage(points), points, stage.spec, settings)
+    return second_stage_inputs(stage(points), points, stage.spec, settings)
 
 
-def proposed_from(
-    found: FirstPass, points: NDArray[np.float32], spec: DetectorSpec, settings: FirstStageSettings
-) -> Proposed:
+def second_stage_inputs(
+    found: FirstStageOutputs, points: NDArray[np.float32], spec: DetectorSpec, settings: FirstStageSettings
+) -> SecondStageInputs:
     """Return the second stage's input from the first stage's outputs `found` for finite points (N, 4) of one scan."""
     proposals = propose(found.maps, spec, settings.proposals, found.cells)
     near = points_near_boxes(points, proposals.boxes, settings.keypoints.margin_m)
     keypoints = np.ascontiguousarray(near[farthest_points(near, settings.keypoints.count), :3])
-    return Proposed(proposals, keypoints, _read_neck(found, keypoints, spec))
+    return SecondStageInputs(proposals, keypoints, _read_neck(found, keypoints, spec))
 
 
-def _read_neck(found: FirstPass, keypoints: NDArray[np.float32], spec: DetectorSpec) -> NDArray[np.float32]:
+def _read_neck(found: FirstStageOutputs, keypoints: NDArray[np.float32], spec: DetectorSpec) -> NDArray[np.float32]:
     x_m, y_m = spec.head_centers_m()
     cells, weights = bilinear_cells(keypoints, x_m, y_m)
     rows = found.neck.reshape(-1, found.neck.shape[-1])

@@ -13,7 +13,7 @@ from asca_pillars.base.strict import Strict
 from asca_pillars.detection.detections import Detections
 from asca_pillars.ops.points.neighbors import ball_query, nearest_in_cubes
 from asca_pillars.ops.points.sampling import points_near_boxes
-from asca_pillars.ops.two_stage.first_stage import Proposed
+from asca_pillars.ops.two_stage.first_stage import SecondStageInputs
 from asca_pillars.ops.two_stage.rois import roi_grid_points
 
 ROI_FEATURES = 4
@@ -76,7 +76,7 @@ class RefineScan:
 
 def refine_scan(
     points: NDArray[np.float32],
-    proposed: Proposed,
+    proposed: SecondStageInputs,
     proposals: Detections,
     settings: RefineSettings,
     executor: Executor | None = None,

@@ -156,14 +156,14 @@ def roi_targets(
     iou = overlaps.iou[rois]
     positive = iou > FOREGROUND_IOU
     own = proposals.boxes[rois]
-    wanted = own.copy()
-    wanted[positive] = boxes[overlaps.matched[rois[positive]]]
+    target_boxes = own.copy()
+    target_boxes[positive] = boxes[overlaps.matched[rois[positive]]]
     return RoiTargets(
         rois=rois,
         confidence=np.clip((iou - low) / (high - low), 0, 1).astype(np.float32),
         positive=positive,
-        residuals=encode_refinement(wanted, own),
-        boxes=wanted,
+        residuals=encode_refinement(target_boxes, own),
+        boxes=target_boxes,
     )
 
 

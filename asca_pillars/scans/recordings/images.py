@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_pillars.base.errors import ScanError
-from asca_pillars.scans.recordings.messages import decoded, time_of
+from asca_pillars.scans.recordings.messages import decode_message, time_of
 from asca_pillars.scans.recordings.other_clouds import foxglove_image
-from asca_pillars.scans.recordings.recording import Message, Recording, Topic, listed, reason
+from asca_pillars.scans.recordings.recording import Message, Recording, Topic, reason, topics_text
 
 ImageKind = Literal["Image", "CompressedImage", "Foxglove"]
 IMAGE_REACH_NS = 500_000_000
@@ -62,15 +62,17 @@ class NearestImages:
         ScanError: there are no images on a topic of that name.
     """
 
-    def __init__(self, recording: Recording, wanted: str | None = None) -> None:
+    def __init__(self, recording: Recording, topic_name: str | None = None) -> None:
         topics = image_topics(recording)
-        named = topics if wanted is None else [topic for topic in topics if topic.name == wanted]
-        if wanted is not None and not named:
-            raise ScanError(f"{recording.path}: no images on a topic {wanted[:80]}; there are {listed(topics)}")
+        named = topics if topic_name is None else [topic for topic in topics if topic.name == topic_name]
+        if topic_name is not None and not named:
+            raise ScanError(
+                f"{recording.path}: no images on a topic {topic_name[:80]}; there are {topics_text(topics)}"
+            )
         self.topic = named[0] if named else None
-        self.others = topics if wanted is None and len(topics) > 1 else []
-        self.shown = self.unreadable = 0
-        self.trouble: str | None = None
+        self.others = topics if topic_name is None and len(topics) > 1 else []
+        self.images_given = self.unreadable = 0
+        self.error_text: str | None = None
         self._recording = recording
         self._coming: Iterator[CameraImage] | None = None
         self._before: CameraImage | None = None
@@ -90,19 +92,19 @@ class NearestImages:
             self._before, self._after = self._after, next(self._coming, None)
         if self._before is None or abs(self._before.time_ns - time_ns) > IMAGE_REACH_NS:
             return None
-        self.shown += 1
+        self.images_given += 1
         return self._before
 
     def remarks(self) -> list[str]:
         """Return sentences about what was left out; call it at the end."""
         if self.topic is None:
             return []
-        said = []
+        notes = []
         if self.unreadable:
-            said.append(f"{self.topic.name}: {self.unreadable} images were left out: {self.trouble}")
-        if not self.shown:
-            said.append(f"{self.topic.name}: no image is within {IMAGE_REACH_NS / 1e9:g} s of a scan")
-        return said
+            notes.append(f"{self.topic.name}: {self.unreadable} images were left out: {self.error_text}")
+        if not self.images_given:
+            notes.append(f"{self.topic.name}: no image is within {IMAGE_REACH_NS / 1e9:g} s of a scan")
+        return notes
 
     def _read(self) -> Iterator[CameraImage]:
         if self.topic is None:
@@ -116,12 +118,12 @@ class NearestImages:
                     image = read_image(message, kind)
                 except Exception as error:  # the library does not catch struct's and NumPy's errors
                     self.unreadable += 1
-                    self.trouble = self.trouble or reason(error)
+                    self.error_text = self.error_text or reason(error)
                 else:
                     yield image
         except ScanError as error:  # of its encoding
             self.unreadable += 1
-            self.trouble = self.trouble or str(error)
+            self.error_text = self.error_text or str(error)
 
 
 def read_image(message: Message, kind: ImageKind) -> CameraImage:
@@ -130,7 +132,7 @@ def read_image(message: Message, kind: ImageKind) -> CameraImage:
     Raises:
         Exception: it is damaged, or neither JPEG, PNG nor pixels of 8 bits.
     """
-    image = foxglove_image(message) if kind == "Foxglove" else decoded(message, f"sensor_msgs/msg/{kind}")
+    image = foxglove_image(message) if kind == "Foxglove" else decode_message(message, f"sensor_msgs/msg/{kind}")
     time_ns = time_of(image.header, message)
     if time_ns is None:
         raise ValueError("no usable time stamp")

@@ -21,7 +21,7 @@ from asca_pillars.scans.recordings.recording import (
     Message,
     Recording,
     Topic,
-    merged,
+    merge_topics,
     reason,
 )
 
@@ -62,7 +62,7 @@ class _Known(NamedTuple):
         return {number for number, channel in self.channels.items() if channel.topic == topic}
 
     def topics(self, counts: dict[int, int]) -> list[Topic]:
-        return merged(
+        return merge_topics(
             Topic(channel.topic, self._type(channel), counts.get(number, 0))
             for number, channel in self.channels.items()
         )

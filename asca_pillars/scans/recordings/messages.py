@@ -15,7 +15,7 @@ _OTHER_TYPES = {
 """Types that the library does not define."""
 
 
-def decoded(message: Message, kind: str) -> Any:
+def decode_message(message: Message, kind: str) -> Any:
     """Decode a stored message of a type such as sensor_msgs/msg/PointCloud2 by ROS' own definitions.
 
     Raises:
@@ -26,10 +26,10 @@ def decoded(message: Message, kind: str) -> Any:
         return store.deserialize_ros1(message.data, kind)
     if message.encoding != "cdr":
         raise ValueError(f"encoded as {message.encoding}; cdr and ros1 are read")
-    return store.deserialize_cdr(uncompressed(message), kind)
+    return store.deserialize_cdr(decompress_message(message), kind)
 
 
-def uncompressed(message: Message) -> bytes:
+def decompress_message(message: Message) -> bytes:
     """Return the bytes of a message; rosbag2 states its compression in its metadata.yaml alone.
 
     Raises:

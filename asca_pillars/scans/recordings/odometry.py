@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_pillars.base.errors import ScanError
-from asca_pillars.geometry.rotations import of_quaternions
-from asca_pillars.scans.recordings.messages import decoded, time_of
+from asca_pillars.geometry.rotations import rotations_from_quaternions
+from asca_pillars.scans.recordings.messages import decode_message, time_of
 from asca_pillars.scans.recordings.recording import Recording, reason
 
 _Doubles = NDArray[np.float64]
@@ -45,7 +45,7 @@ class Poses:
         matrix = np.eye(4)
         matrix[:3, 3] = (1 - share) * self.positions_m[before] + share * self.positions_m[after]
         turn = (1 - share) * self.quaternions[before] + share * self.quaternions[after]
-        matrix[:3, :3] = of_quaternions(turn)
+        matrix[:3, :3] = rotations_from_quaternions(turn)
         return matrix
 
 
@@ -62,7 +62,7 @@ def read_poses(recording: Recording, topic: str) -> Poses:
     rows, trouble = [], "no message"
     for message in recording.messages(topic):
         try:
-            odometry = decoded(message, ODOMETRY_TYPES[0])
+            odometry = decode_message(message, ODOMETRY_TYPES[0])
         except Exception as error:  # the library does not catch struct's errors
             trouble = reason(error)
             continue

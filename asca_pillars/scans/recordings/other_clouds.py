@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from asca_pillars.geometry.rotations import of_quaternions, transform_points
-from asca_pillars.scans.recordings.messages import decoded, uncompressed
+from asca_pillars.geometry.rotations import rotations_from_quaternions, transform_points
+from asca_pillars.scans.recordings.messages import decode_message, decompress_message
 from asca_pillars.scans.recordings.recording import Message
 from asca_pillars.scans.records import MAX_POINTS, Field, StoredPoints, assemble_points
 
@@ -31,7 +31,7 @@ def point_cloud(message: Message) -> tuple[Any, StoredPoints]:
     Raises:
         Exception: it is damaged.
     """
-    cloud = decoded(message, "sensor_msgs/msg/PointCloud")
+    cloud = decode_message(message, "sensor_msgs/msg/PointCloud")
     xyz = np.array([(point.x, point.y, point.z) for point in cloud.points], np.float32).reshape(-1, 3)
     channel = next((one for name in _REFLECTANCE for one in cloud.channels if one.name.lower() == name), None)
     if channel is None:
@@ -47,7 +47,7 @@ def livox_cloud(message: Message) -> tuple[Any, StoredPoints]:
     Raises:
         Exception: it is damaged.
     """
-    data = uncompressed(message)
+    data = decompress_message(message)
     if message.encoding == "ros1":
         _, sec, nanosec, length = struct.unpack_from("<IIII", data)
         name, start, stride = 16, 16 + length + 8 + 4 + 4, 19
@@ -122,12 +122,12 @@ def foxglove_image(message: Message) -> Any:
     return SimpleNamespace(header=header, format=format_, data=data)
 
 
-def posed(points: StoredPoints, pose: Any) -> StoredPoints:
+def apply_pose(points: StoredPoints, pose: Any) -> StoredPoints:
     """Transform points (N, 3) by a foxglove.Pose, (x, y, z, w, x, y, z)."""
     shift, turn = np.array(pose[:3], float), np.array(pose[3:], float)
     if not np.linalg.norm(turn):  # not given
         turn = np.array([1.0, 0, 0, 0])
-    matrix = of_quaternions(turn)
+    matrix = rotations_from_quaternions(turn)
     if np.array_equal(matrix, np.eye(3)) and not shift.any():
         return points
     return points._replace(xyz=transform_points(points.xyz, matrix, shift))

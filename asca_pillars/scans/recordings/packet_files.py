@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from asca_pillars.base.errors import ScanError
 from asca_pillars.base.extras import require
 from asca_pillars.scans.find_scans import visible_files
-from asca_pillars.scans.recordings.messages import decoded
+from asca_pillars.scans.recordings.messages import decode_message
 from asca_pillars.scans.recordings.recording import Message, Recording, Topic, reason
 from asca_pillars.scans.records import StoredPoints
 
@@ -142,7 +142,7 @@ class OusterPackets:
         if message is None:
             raise ScanError(f"{place}: no metadata of the Ouster, which {topic.name} needs; record that topic, too")
         try:
-            self._info: Any = core.SensorInfo(decoded(message, "std_msgs/msg/String").data)
+            self._info: Any = core.SensorInfo(decode_message(message, "std_msgs/msg/String").data)
             self._format: Any = core.PacketFormat(self._info)
         except Exception as error:  # the libraries have errors of their own
             raise ScanError(f"{place}: no readable metadata of an Ouster ({reason(error)}); record it again") from None
@@ -157,7 +157,7 @@ class OusterPackets:
         batcher, frame, packets = core.FrameBatcher(self._info), core.LidarFrame(self._info), 0
         for message in self._recording.messages(self._topic):
             try:
-                payload = np.asarray(decoded(message, PACKET_MSG).buf, np.uint8)
+                payload = np.asarray(decode_message(message, PACKET_MSG).buf, np.uint8)
             except Exception:  # the library does not catch struct's and NumPy's errors
                 continue
             if len(payload) < self._format.lidar_packet_size:
@@ -181,7 +181,7 @@ def velodyne_scan(message: Message) -> tuple[Any, StoredPoints]:
     """
     import velodyne_decoder
 
-    scan = decoded(message, "velodyne_msgs/msg/VelodyneScan")
+    scan = decode_message(message, "velodyne_msgs/msg/VelodyneScan")
     packets = velodyne_decoder.PacketVector()
     for one in scan.packets:
         stamp_s = one.stamp.sec + one.stamp.nanosec / 1e9

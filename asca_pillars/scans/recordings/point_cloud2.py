@@ -5,8 +5,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from asca_pillars.base.errors import ScanError
-from asca_pillars.scans.recordings.messages import decoded, time_of
-from asca_pillars.scans.recordings.other_clouds import foxglove_cloud, livox_cloud, packed_points, point_cloud, posed
+from asca_pillars.scans.recordings.messages import decode_message, time_of
+from asca_pillars.scans.recordings.other_clouds import (
+    apply_pose,
+    foxglove_cloud,
+    livox_cloud,
+    packed_points,
+    point_cloud,
+)
 from asca_pillars.scans.recordings.packet_files import velodyne_scan
 from asca_pillars.scans.recordings.recording import Message, reason
 from asca_pillars.scans.recordings.scan_types import ScanKind
@@ -49,8 +55,8 @@ def read_point_cloud(message: Message, source: str, kind: ScanKind = "PointCloud
         raise ScanError(f"{source}: no readable {name} ({reason(error)}); record it again") from None
     time_ns = time_of(header, message)
     if time_ns is None:
-        said = "neither the header nor the recording has a usable time stamp, it was taken as 0"
-        points, time_ns = points._replace(remarks=(*points.remarks, said)), 0
+        note = "neither the header nor the recording has a usable time stamp, it was taken as 0"
+        points, time_ns = points._replace(remarks=(*points.remarks, note)), 0
     return PointCloud(points, time_ns, str(header.frame_id), fields)
 
 
@@ -64,9 +70,9 @@ def _read(message: Message, source: str, kind: ScanKind) -> tuple[Any, StoredPoi
         return *point_cloud(message), ()
     if kind == "Livox":
         return *livox_cloud(message), ()
-    cloud = foxglove_cloud(message) if kind == "Foxglove" else decoded(message, "sensor_msgs/msg/PointCloud2")
+    cloud = foxglove_cloud(message) if kind == "Foxglove" else decode_message(message, "sensor_msgs/msg/PointCloud2")
     points, fields = point_cloud_points(cloud, source), tuple(str(field.name) for field in cloud.fields)
-    return cloud.header, posed(points, cloud.pose) if kind == "Foxglove" else points, fields
+    return cloud.header, apply_pose(points, cloud.pose) if kind == "Foxglove" else points, fields
 
 
 def point_cloud_points(cloud: Any, source: str) -> StoredPoints:
@@ -93,13 +99,13 @@ def point_cloud_points(cloud: Any, source: str) -> StoredPoints:
             Field(str(field.name), np.dtype(order + _DATATYPES[field.datatype - 1]), max(int(field.count), 1))
         )
         offsets.append(int(field.offset))
-    wanted = select_fields(source, fields)
-    for index in wanted:
+    selected = select_fields(source, fields)
+    for index in selected:
         if offsets[index] + fields[index].size_bytes > step:
             raise ScanError(
                 f"{source}: field {fields[index].name} at byte {offsets[index]} lies beyond the points' {step} bytes"
             )
-    chosen = [fields[index] for index in wanted]
+    chosen = [fields[index] for index in selected]
     if not count:
         return assemble_points(0, [np.zeros(0, field.dtype) for field in chosen], chosen)
     if height == 1 or len(data) == count * step:
@@ -111,7 +117,7 @@ def point_cloud_points(cloud: Any, source: str) -> StoredPoints:
             "need more; record it again"
         )
     columns = []
-    for index in wanted:
+    for index in selected:
         view = np.ndarray((height, width), fields[index].dtype, data, offsets[index], (row_step, step))
         columns.append(view.reshape(-1))
     return assemble_points(count, columns, chosen)

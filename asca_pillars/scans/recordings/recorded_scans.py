@@ -13,7 +13,7 @@ from asca_pillars.scans.recordings.packet_files import OusterPackets
 from asca_pillars.scans.recordings.point_cloud2 import PointCloud, read_point_cloud
 from asca_pillars.scans.recordings.recording import Message, Recording, Topic
 from asca_pillars.scans.recordings.scan_types import kind_of_scans
-from asca_pillars.scans.scan_input import said_of_scale
+from asca_pillars.scans.scan_input import scale_notes
 from asca_pillars.scans.scan_reader import ReflectanceScale, Scan, finite_scan
 from asca_pillars.scans.scan_settings import SEARCHED_SCANS, ScanSettings
 from asca_pillars.scans.stored_scans import FolderScale, common_reflectance_scale, has_finite_point
@@ -35,7 +35,7 @@ class RecordedScan(NamedTuple):
     time_ns: int
     frame_id: str
     scan: Scan | None
-    trouble: str | None = None
+    error_text: str | None = None
     fields: tuple[str, ...] = ()
 
 
@@ -89,11 +89,11 @@ class RecordedScans:
         Raises:
             ConfigError, ScanError: as `ScanSettings.mounting`.
         """
-        said = [*self.recording.notes, f"{self.topic.name}: {self.topic.messages} scans", *said_of_scale(self.scale)]
+        notes = [*self.recording.notes, f"{self.topic.name}: {self.topic.messages} scans", *scale_notes(self.scale)]
         mounting, estimate = reading.mounting(self.samples())
         if estimate is not None:
-            said.append(f"sensor height: {estimate}")
-        return mounting, said
+            notes.append(f"sensor height: {estimate}")
+        return mounting, notes
 
     def read(self, start: int = 0) -> Iterator[RecordedScan]:
         """Yield all scans from message `start` on; see `recording.damage` if damage ends the recording early."""

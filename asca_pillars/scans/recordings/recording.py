@@ -60,33 +60,33 @@ class Recording(ABC):
     def messages(self, topic: str) -> Iterator[Message]:
         """Yield the messages of a topic by time; a damaged recording ends early (`damage`)."""
 
-    def point_cloud_topic(self, wanted: str | None = None) -> Topic:
+    def point_cloud_topic(self, topic_name: str | None = None) -> Topic:
         """Return the topic of that name, or the only one with scans.
 
         Raises:
             ScanError: there is none, it holds something else, or there are several; names all available ones.
         """
         clouds = [topic for topic in self.topics if topic.is_point_cloud]
-        if wanted is not None:
-            named = [topic for topic in self.topics if topic.name == wanted]
+        if topic_name is not None:
+            named = [topic for topic in self.topics if topic.name == topic_name]
             if not named:
                 lost = f"; {self.damage}" if self.damage else ""
-                raise ScanError(f"{self.path}: no topic {wanted[:80]}; there are {listed(self.topics)}{lost}")
+                raise ScanError(f"{self.path}: no topic {topic_name[:80]}; there are {topics_text(self.topics)}{lost}")
             if not named[0].is_point_cloud and named[0].type != UNKNOWN_TYPE:
-                held = f"{self.path}: {wanted} holds {named[0].type}"
+                held = f"{self.path}: {topic_name} holds {named[0].type}"
                 if conversion := conversion_of(named[0].type):
                     raise ScanError(f"{held}, a type of scans that is not read: {conversion}")
-                remedy = f"choose one of {listed(clouds)}" if clouds else self._remedy(self.topics)
+                remedy = f"choose one of {topics_text(clouds)}" if clouds else self._remedy(self.topics)
                 raise ScanError(f"{held}, not scans (sensor_msgs/msg/PointCloud2); {remedy}")
             return named[0]
         filled = [topic for topic in clouds if topic.messages] or clouds
         if not filled:
-            none = f"no topic of type sensor_msgs/msg/PointCloud2; there are {listed(self.topics)}"
+            none = f"no topic of type sensor_msgs/msg/PointCloud2; there are {topics_text(self.topics)}"
             if self.damage:
                 raise ScanError(f"{self.damage}; in what can be read {none}: copy or record it again")
             raise ScanError(f"{self.path}: {none}: {self._remedy(self.topics)}")
         if len(filled) > 1:
-            raise ScanError(f"{self.path}: several topics hold scans, give --topic: {listed(filled)}")
+            raise ScanError(f"{self.path}: several topics hold scans, give --topic: {topics_text(filled)}")
         return filled[0]
 
     def _remedy(self, topics: Sequence[Topic]) -> str:
@@ -99,12 +99,12 @@ class Recording(ABC):
         return "record the scans, too"
 
 
-def listed(topics: Sequence[Topic]) -> str:
+def topics_text(topics: Sequence[Topic]) -> str:
     """Return the topics with their types and counts, in one line."""
     return ", ".join(f"{topic.name} ({topic.type}, {topic.messages})" for topic in topics) or "none"
 
 
-def merged(topics: Iterable[Topic]) -> list[Topic]:
+def merge_topics(topics: Iterable[Topic]) -> list[Topic]:
     """Return the topics by name, with those of one name merged and their messages added."""
     by_name: dict[str, list[Topic]] = {}
     for topic in topics:

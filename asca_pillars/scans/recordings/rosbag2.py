@@ -7,7 +7,7 @@ from pathlib import Path
 import yaml
 
 from asca_pillars.base.settings import MAX_CHARACTERS, parse_yaml
-from asca_pillars.scans.recordings.recording import Message, Recording, merged
+from asca_pillars.scans.recordings.recording import Message, Recording, merge_topics
 
 METADATA_FILE = "metadata.yaml"
 _KEY = "rosbag2_bagfile_information"
@@ -56,7 +56,7 @@ class SplitRecording(Recording):
         self, path: Path, files: Sequence[Recording], counts: Mapping[str, int], trouble: str | None = None
     ) -> None:
         self.path, self._files, self._counts, self._trouble = path, files, counts, trouble
-        self.topics = merged(topic for file in files for topic in file.topics)
+        self.topics = merge_topics(topic for file in files for topic in file.topics)
         self.notes = tuple(note for file in files for note in file.notes)
         self.damage = trouble or next((file.damage for file in files if file.damage), None)
 

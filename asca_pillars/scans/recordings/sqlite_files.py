@@ -6,7 +6,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from asca_pillars.base.errors import ScanError
-from asca_pillars.scans.recordings.recording import LAST_NS, UNKNOWN_TYPE, Message, Recording, Topic, merged, reason
+from asca_pillars.scans.recordings.recording import (
+    LAST_NS,
+    UNKNOWN_TYPE,
+    Message,
+    Recording,
+    Topic,
+    merge_topics,
+    reason,
+)
 
 if TYPE_CHECKING:
     import sqlite3  # not included in every Python
@@ -89,7 +97,7 @@ class SqliteRecording(Recording):
             topics.append(Topic(name, kind, counts.pop(number, 0)))
             self._numbers.setdefault(name, []).append(number)
             self._formats.setdefault(name, set()).add(encoding if isinstance(encoding, str) and encoding else "cdr")
-        self.topics = merged(topics)
+        self.topics = merge_topics(topics)
         if lost := sum(counts.values()):
             self.damage = f"{self.path}: {lost} messages belong to no topic with a name"
 

@@ -146,7 +146,7 @@ def cast_ellipsoids(
             continue
         leaves = leaves_of(surface[e, 2], distance, slopes, per_turn)
         cloud = leaves.density_per_m > 0.0
-        who, salt = owners[e], salts[e]
+        owner, salt = owners[e], salts[e]
         for k in range(window.first_ring, window.last_ring):
             first, last = columns_of(window, phase_counts[k], first_column, columns)
             if first >= last:
@@ -170,16 +170,16 @@ def cast_ellipsoids(
                     continue
                 root = np.sqrt(root)
                 leave, reach = (-pq + root) / qq, (-pq - root) / qq
-                if leave <= 0.0 or (reach <= 0.0 and not cloud) or (who < 0 and reach >= rho[k, j]):
+                if leave <= 0.0 or (reach <= 0.0 and not cloud) or (owner < 0 and reach >= rho[k, j]):
                     continue
                 if cloud:
                     depth = -np.log(leaf_chance(leaves, k, number[j], salt, key)) / (leaves.density_per_m * stretch[k])
                     reach = max(reach, 0.0) + depth
                     if reach >= leave:
                         continue
-                if who >= 0 and counted[j] and stamp[k, j] != who:
-                    stamp[k, j] = who
-                    alone[who] += 1
+                if owner >= 0 and counted[j] and stamp[k, j] != owner:
+                    stamp[k, j] = owner
+                    alone[owner] += 1
                 if reach >= rho[k, j]:
                     continue
                 if cloud:  # leaves have any orientation
@@ -187,4 +187,4 @@ def cast_ellipsoids(
                 else:
                     x, y, z = p0 + reach * q0, p1 + reach * q1, p2 + reach * q2
                     cosine = solid_cosine(m, x, y, z, dx, dy, dz, stretch[k])
-                keep(nearest, k, j, reach, who, cosine, surface[e, 0], surface[e, 1])
+                keep(nearest, k, j, reach, owner, cosine, surface[e, 0], surface[e, 1])

@@ -141,7 +141,7 @@ def cast_triangles(
         bx, by, bz = corner[1, 0], corner[1, 1], corner[1, 2]
         cx, cy, cz = corner[2, 0], corner[2, 1], corner[2, 2]
         ab, bc, ca = edge_of(ax, ay, az, bx, by, bz), edge_of(bx, by, bz, cx, cy, cz), edge_of(cx, cy, cz, ax, ay, az)
-        who, salt, transparency = owners[t], salts[t], surface[t, 2]
+        owner, salt, transparency = owners[t], salts[t], surface[t, 2]
         for k in range(window.first_ring, window.last_ring):
             first, last = columns_of(window, phase_counts[k], first_column, columns)
             if first >= last:
@@ -162,13 +162,13 @@ def cast_triangles(
                     continue
                 reach = away / facing
                 hidden = reach >= rho[k, j]
-                counts = who >= 0 and counted[j] and stamp[k, j] != who
+                counts = owner >= 0 and counted[j] and stamp[k, j] != owner
                 if reach <= 0.0 or (hidden and not counts):
                     continue
                 if transparency > 0.0 and ray_chance(key, k, number[j], salt) < transparency:
                     continue
                 if counts:
-                    stamp[k, j] = who
-                    alone[who] += 1
+                    stamp[k, j] = owner
+                    alone[owner] += 1
                 if not hidden:
-                    keep(nearest, k, j, reach, who, abs(facing) / stretch[k], surface[t, 0], surface[t, 1])
+                    keep(nearest, k, j, reach, owner, abs(facing) / stretch[k], surface[t, 0], surface[t, 1])

@@ -86,8 +86,8 @@ def to_markdown(comparison: Comparison, plots: Sequence[str]) -> str:
         parts.append(f"## {group[0].upper()}{group[1:]}\n\n{markdown_table(columns, rows, _LEFT)}")
     real, ours = comparison.real.label_fit, comparison.simulated.label_fit
     if ours:
-        both = {name: real.get(name, ()) + ours.get(name, ()) for name in dict.fromkeys([*real, *ours])}
-        parts.append(f"## The same by drive\n\n{fits_table(both)}")
+        combined = {name: real.get(name, ()) + ours.get(name, ()) for name in dict.fromkeys([*real, *ours])}
+        parts.append(f"## The same by drive\n\n{fits_table(combined)}")
     parts += [f"![{name.removesuffix('.png').replace('_', ' ')}]({name})\n" for name in plots]
     return "\n".join(parts)
 

@@ -28,7 +28,7 @@ _FADED = np.exp(FADING * _NORMAL)
 _NOISE_SALT, _FATE_SALT = 1, 2
 
 
-class Met(NamedTuple):
+class FirstHits(NamedTuple):
     """First hits of the firings (K,C), as in `Hits`; rho is infinite without a hit."""
 
     rho_m: Floats
@@ -145,7 +145,9 @@ def fade_of(slant: float, near_fade: float, receiver: Receiver) -> float:
 
 
 @cached(**PLAIN)
-def report_firings(met: Met, lasers: Lasers, receiver: Receiver, key: int) -> tuple[Singles, NDArray[np.int32], Ints]:
+def report_firings(
+    met: FirstHits, lasers: Lasers, receiver: Receiver, key: int
+) -> tuple[Singles, NDArray[np.int32], Ints]:
     """Return points (N, 4) in the LiDAR frame, indices of their owners (N,) and rings (N,), ring by ring."""
     rho, cosine, reflectance, owners, hidden = met.rho_m, met.cosine, met.reflectance, met.owner, met.hidden
     slopes, stretch, origins, cos_phase, sin_phase, biases, gains, sigmas, faints, near_fades = lasers[:10]
@@ -243,7 +245,7 @@ def measure(hits: Hits, firings: Firings, rng: np.random.Generator) -> Returns:
         split_lost_share=float(lidar.split_lost_share),
         columns_per_turn=firings.columns_per_turn,
     )
-    met = Met(
+    met = FirstHits(
         rho_m=np.ascontiguousarray(hits.rho_m, np.float64),
         cosine=np.ascontiguousarray(hits.cosine, np.float32),
         reflectance=np.ascontiguousarray(hits.reflectance, np.float32),

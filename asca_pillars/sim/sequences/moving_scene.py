@@ -30,7 +30,7 @@ _HELD_M = 12.0
 
 
 @dataclass(frozen=True)
-class Way:
+class Trajectory:
     """Straight path through the world.
 
     Attributes:
@@ -49,7 +49,7 @@ class Way:
     to_m: float = np.inf
     ring: bool = False
 
-    def at(self, times_s: Floats) -> "Places":
+    def at(self, times_s: Floats) -> "TrajectoryPoints":
         """Return poses at times (T,), seconds from the middle of the sequence."""
         gone = np.asarray(times_s, float) * self.speed_mps
         way = np.clip(gone, self.from_m, self.to_m)
@@ -59,10 +59,10 @@ class Way:
             laps = np.floor(x / RING_M + 0.5).astype(np.int64)
             x = x - RING_M * laps
         speed = np.where((way == gone) & (self.speed_mps > 0), self.speed_mps, 0.0)
-        return Places(np.column_stack([x, y]), way, speed, laps)
+        return TrajectoryPoints(np.column_stack([x, y]), way, speed, laps)
 
 
-class Places(NamedTuple):
+class TrajectoryPoints(NamedTuple):
     """Positions on a path at T times."""
 
     xy_m: Floats
@@ -75,16 +75,16 @@ class Places(NamedTuple):
     """(T,) number of times it has left the street."""
 
 
-class Going(NamedTuple):
+class MovingTarget(NamedTuple):
     """Object and its path."""
 
     target: Target
-    way: Way
+    way: Trajectory
 
 
-def draw_ways(
+def draw_trajectories(
     targets: list[Target], ground: Ground, kind: str, duration_s: float, rng: np.random.Generator
-) -> tuple[Way, list[Going]]:
+) -> tuple[Trajectory, list[MovingTarget]]:
     """Return the path of the car, and those of the objects that never touch the car or each other.
 
     An object whose path is not free does not move; one that is still in the way is left out.
@@ -99,12 +99,12 @@ def draw_ways(
     flow: dict[tuple[int, float], float] = {}
     limit = TRAVEL_M / duration_s
     lane = _lane(0.0, ground)
-    ego = Way(0.0, 0.0, 0.0, min(float(rng.uniform(*FLOW_MPS[kind])), limit))
+    ego = Trajectory(0.0, 0.0, 0.0, min(float(rng.uniform(*FLOW_MPS[kind])), limit))
     flow[lane, 0.0] = ego.speed_mps
     times = np.arange(-duration_s / 2, duration_s / 2 + STEP_S, STEP_S)
     taken = [_footprints(ego, times, (*EGO_M, 0.0), APART_M)]
     drawn = [_way(target, ground, kind, flow, rng) for target in targets]
-    kept: dict[int, Going] = {}
+    kept: dict[int, MovingTarget] = {}
     # Objects that cannot move come first: they have no alternative.
     for index in sorted(range(len(targets)), key=lambda index: drawn[index].speed_mps > 0):
         target = targets[index]
@@ -112,16 +112,16 @@ def draw_ways(
         apart = PEOPLE_APART_M if target.type in ON_FOOT else APART_M
         drawn_way = drawn[index]
         # Traffic does not stop in its lane: following vehicles would hit it.
-        for way in (drawn_way,) if drawn_way.ring else (drawn_way, Way(x, y, yaw)):
+        for way in (drawn_way,) if drawn_way.ring else (drawn_way, Trajectory(x, y, yaw)):
             footprints = _footprints(way, times, size, apart)
             if not any(_touch(footprints, other) for other in taken):
                 taken.append(footprints)
-                kept[index] = Going(target, way)
+                kept[index] = MovingTarget(target, way)
                 break
     return ego, [kept[index] for index in sorted(kept)]
 
 
-def held_footprints(way: Way, size: tuple[float, float], duration_s: float) -> list[tuple[float, ...]]:
+def held_footprints(way: Trajectory, size: tuple[float, float], duration_s: float) -> list[tuple[float, ...]]:
     """Return footprints x, y, length, width, yaw, metres, that cover all of a path during a sequence."""
     length, width = size
     half = way.speed_mps * duration_s / 2
@@ -139,29 +139,29 @@ def held_footprints(way: Way, size: tuple[float, float], duration_s: float) -> l
 
 def _way(
     target: Target, ground: Ground, kind: str, flow: dict[tuple[int, float], float], rng: np.random.Generator
-) -> Way:
+) -> Trajectory:
     """Return a path for the object's motion; other objects are not considered."""
     x, y, yaw = float(target.box[0]), float(target.box[1]), float(target.box[6])
-    still, waits = Way(x, y, yaw), rng.random() < STANDING_SHARE
+    still, waits = Trajectory(x, y, yaw), rng.random() < STANDING_SHARE
     along = 0.0 if np.cos(yaw) > 0 else np.pi
     aside = y - ground.to_lidar(0.0, 0.0)[1]  # distance from the middle of the road
     if target.going == "lane":
         key = (_lane(y, ground), along)
         if key not in flow:
             flow[key] = 0.0 if waits else float(rng.uniform(*FLOW_MPS[kind]))
-        return Way(x, y, along, flow[key], ring=True)
+        return Trajectory(x, y, along, flow[key], ring=True)
     if target.going == "crossing":
-        return still if waits else Way(x, y, yaw, float(rng.uniform(*CROSSING_MPS)))
+        return still if waits else Trajectory(x, y, yaw, float(rng.uniform(*CROSSING_MPS)))
     edge = max(abs(aside), ground.half_width_m + ground.pavement_m + 0.3)
     if target.going == "riding" and abs(np.sin(yaw)) < 0.5:
         # All of the path along the street has to be free, so that riders keep to the pavement.
         side = float(np.sign(aside)) * min(abs(aside), ground.half_width_m + max(ground.pavement_m, 1.0))
-        return still if waits else Way(x, y - aside + side, along, float(rng.uniform(*RIDING_MPS)), ring=True)
+        return still if waits else Trajectory(x, y - aside + side, along, float(rng.uniform(*RIDING_MPS)), ring=True)
     if target.going in ("riding", "walking") and not waits:
         speed = float(rng.uniform(*(RIDING_MPS if target.going == "riding" else WALKING_MPS)))
         ends = np.sort((np.array([-edge, edge]) - aside) / (np.sin(yaw) or 1e-9))
         low, high = np.clip(ends, -WALK_M, WALK_M)
-        return Way(x, y, yaw, speed, float(low), float(high))
+        return Trajectory(x, y, yaw, speed, float(low), float(high))
     return still
 
 
@@ -169,7 +169,7 @@ def _lane(y_m: float, ground: Ground) -> int:
     return int(np.floor((y_m - ground.to_lidar(0.0, 0.0)[1]) / LANE_M))
 
 
-def _footprints(way: Way, times_s: Floats, size: ArrayLike, apart_m: float) -> Floats:
+def _footprints(way: Trajectory, times_s: Floats, size: ArrayLike, apart_m: float) -> Floats:
     """Return (T, 7) boxes, of which only the footprints are used."""
     boxes = np.zeros((len(times_s), 7))
     boxes[:, :2] = way.at(times_s).xy_m
@@ -188,7 +188,7 @@ FAR_M = 115.0  # beyond every sensor's range
 MAX_RELIEF_M = 0.5  # the car does not pitch, so its street has to be level
 
 
-class Moment(NamedTuple):
+class SceneState(NamedTuple):
     """Street at one time, in the LiDAR frame of that time."""
 
     scene: Scene
@@ -205,11 +205,11 @@ class MovingScene:
     """Street in the middle of the sequence, with the paths of the car and of each of its targets."""
 
     scene: Scene
-    ego: Way
-    ways: tuple[Way, ...]
+    ego: Trajectory
+    trajectories: tuple[Trajectory, ...]
     duration_s: float
 
-    def at(self, time_s: float) -> Moment:
+    def at(self, time_s: float) -> SceneState:
         """Return the street `time_s` after the sequence's start."""
         times = np.array([time_s - self.duration_s / 2])
         driven = float(self.ego.at(times).xy_m[0, 0])
@@ -218,7 +218,7 @@ class MovingScene:
         lifted = float(there - here)  # the sensor's height above the street is constant
         street = ground.street._replace(along_m=driven, cross_u_m=ground.street.cross_u_m - driven)
         targets, ids, velocities = [], [], []
-        for index, (target, way) in enumerate(zip(self.scene.targets, self.ways, strict=True)):
+        for index, (target, way) in enumerate(zip(self.scene.targets, self.trajectories, strict=True)):
             place = way.at(times)
             x, y = place.xy_m[0].tolist()
             if abs(x - driven) > FAR_M:
@@ -228,7 +228,7 @@ class MovingScene:
             box[6] = (way.heading_rad + np.pi) % (2 * np.pi) - np.pi
             walked = float(place.gone_m[0]) if target.type == "Pedestrian" else 0.0
             targets.append(replace(target, box=box, walked_m=walked))
-            ids.append(index + len(self.ways) * _unsigned(int(place.laps[0])))
+            ids.append(index + len(self.trajectories) * _unsigned(int(place.laps[0])))
             velocities.append(place.speed_mps[0] * np.array([np.cos(way.heading_rad), np.sin(way.heading_rad)]))
         pose = np.eye(4)
         pose[:3, 3] = driven, 0.0, lifted
@@ -238,7 +238,7 @@ class MovingScene:
             targets=tuple(targets),
             background=self.scene.background.placed(-driven, 0.0, -lifted, 0.0),
         )
-        return Moment(scene, tuple(ids), np.array(velocities).reshape(-1, 2), pose)
+        return SceneState(scene, tuple(ids), np.array(velocities).reshape(-1, 2), pose)
 
 
 def draw_moving_scene(
@@ -256,12 +256,12 @@ def draw_moving_scene(
         turning_share=0.0,
         relief_m=(0.0, min(config.relief_m[1], MAX_RELIEF_M)),
     )
-    ego, going = Way(0.0, 0.0, 0.0), list[Going]()
+    ego, going = Trajectory(0.0, 0.0, 0.0), list[MovingTarget]()
 
     def arrange(placer: Placer) -> None:
         nonlocal ego, going
         targets = [target for target in placer.targets if abs(target.box[0]) < config.reach_m]
-        ego, going = draw_ways(targets, placer.ground, placer.kind, duration_s, rng_of_ways)
+        ego, going = draw_trajectories(targets, placer.ground, placer.kind, duration_s, rng_of_ways)
         kept = [item.target for item in going]
         placer.targets[:] = kept
         placer.half_hidden[:] = [target for target in placer.half_hidden if any(target is one for one in kept)]

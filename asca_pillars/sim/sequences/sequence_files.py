@@ -36,7 +36,7 @@ from asca_pillars.sim.parallel import (
     write_once,
 )
 from asca_pillars.sim.sensor.lidar import Firings, draw_firings
-from asca_pillars.sim.sequences.moving_scene import Moment, MovingScene, draw_moving_scene
+from asca_pillars.sim.sequences.moving_scene import MovingScene, SceneState, draw_moving_scene
 from asca_pillars.sim.simulation import SimulationConfig, take_scan
 from asca_pillars.sim.world.streets import draws_of
 
@@ -93,7 +93,7 @@ def simulate_sequence_frame(plan: SequencePlan, sequence: int, index: int) -> Se
     return SequenceFrame(np.ascontiguousarray(points), labels)
 
 
-def frame_labels(moment: Moment, time_s: float, points: list[int], occluded: list[int]) -> dict[str, Any]:
+def frame_labels(moment: SceneState, time_s: float, points: list[int], occluded: list[int]) -> dict[str, Any]:
     """Return the labels of a scan as plain values: `time_s`, `ego_pose` and `boxes` of all objects with a return.
 
     A box is a record of `data.boxes.box_records`, LiDAR frame, with `track_id`, `vx_mps` and `vy_mps` (over ground,

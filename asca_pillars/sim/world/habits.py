@@ -12,7 +12,7 @@ QUARTER_TURNS = (0.0, np.pi, np.pi / 2, -np.pi / 2)
 NOSE_IN_M, ALONG_M = (0.5, 1.1), (0.4, 1.8)  # gaps between parked cars side by side and one behind the other
 
 
-Going: TypeAlias = Literal["still", "lane", "crossing", "riding", "walking"]
+MotionKind: TypeAlias = Literal["still", "lane", "crossing", "riding", "walking"]
 """Motion of an object: used in a sequence, not in a single scan."""
 
 
@@ -32,7 +32,7 @@ class Candidate(NamedTuple):
     company: list[Neighbor] | None = None  # list that it joins as a neighbor once it is placed
     neighbor: Neighbor | None = None
     half_hidden: bool = False  # to be partly occluded by another object
-    going: Going = "still"
+    going: MotionKind = "still"
 
 
 class Habits:
@@ -170,7 +170,7 @@ class Habits:
         length: float = 0.0,
         sway: tuple[float, float] = (0.0, 0.0),
         *,
-        going: Going = "still",
+        going: MotionKind = "still",
     ) -> Candidate:
         """Return a candidate that joins `company` once placed; `sway` is the spread of its position and heading."""
         across, turn = (float(self.rng.normal(0.0, spread)) if spread else 0.0 for spread in sway)

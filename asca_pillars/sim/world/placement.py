@@ -10,7 +10,7 @@ from asca_pillars.base.compiling import cached
 from asca_pillars.geometry.arrays import Floats
 from asca_pillars.sim.scene_config import SceneConfig
 from asca_pillars.sim.world.ground import Ground
-from asca_pillars.sim.world.habits import Candidate, Going, Habits
+from asca_pillars.sim.world.habits import Candidate, Habits, MotionKind
 
 
 @dataclass(frozen=True)
@@ -157,7 +157,7 @@ class Target:
     type: str
     box: Floats
     lift_m: float = 0.0
-    going: Going = "still"
+    going: MotionKind = "still"
     walked_m: float = 0.0
 
 

@@ -20,7 +20,7 @@ from asca_pillars.scans.mounting import Mounting
 ON_THE_CPU = ("cpu", "openvino")  # the number of threads matters to these
 
 
-class Way(NamedTuple):
+class RunConfiguration(NamedTuple):
     """One way of running a bundle."""
 
     bundle: str
@@ -33,7 +33,7 @@ class Way(NamedTuple):
 class MatrixRow:
     """One way of running a bundle, how fast it is and how much its boxes differ from the reference's; or why not."""
 
-    way: Way
+    way: RunConfiguration
     speed: Contestant | None
     """`speedup` is over the reference: the first bundle on stock onnxruntime's CPU provider, default threads."""
     boxes: BoxDifference | None
@@ -58,10 +58,14 @@ def measure_matrix(
         mounting: of their sensor.
         threads: compared with a single one; None for the physical cores granted to the process.
     """
-    opened: dict[Way, Detector | str] = {}
-    ways = [way for bundle in bundles for way in _ways(bundle, default_threads() if threads is None else threads)]
-    for number in track(len(ways), "opening"):
-        way = ways[number]
+    opened: dict[RunConfiguration, Detector | str] = {}
+    configurations = [
+        way
+        for bundle in bundles
+        for way in _run_configurations(bundle, default_threads() if threads is None else threads)
+    ]
+    for number in track(len(configurations), "opening"):
+        way = configurations[number]
         # A way that fails with these threads fails with others too, and gets one row.
         if not any(isinstance(result, str) and _same_but_threads(way, other) for other, result in opened.items()):
             opened[way] = _open(bundles[way.bundle], way, scans[0], mounting)
@@ -77,21 +81,21 @@ def measure_matrix(
     )
 
 
-def _ways(bundle: str, most: int) -> list[Way]:
+def _run_configurations(bundle: str, most: int) -> list[RunConfiguration]:
     return [
-        Way(bundle, provider, precision, threads)
+        RunConfiguration(bundle, provider, precision, threads)
         for provider in sorted(PROVIDERS, key=lambda name: name != "cpu")
         for precision in PRECISIONS
         for threads in sorted({most, 1} if provider in ON_THE_CPU else {most}, reverse=True)
     ]
 
 
-def _same_but_threads(way: Way, failed: Way) -> bool:
+def _same_but_threads(way: RunConfiguration, failed: RunConfiguration) -> bool:
     """Return whether `way` would fail for the same reason; another precision might not."""
     return way[:3] == failed[:3]
 
 
-def _open(folder: Path, way: Way, scan: NDArray[np.float32], mounting: Mounting | None) -> Detector | str:
+def _open(folder: Path, way: RunConfiguration, scan: NDArray[np.float32], mounting: Mounting | None) -> Detector | str:
     """Return the detector after its first scan, or why it cannot be opened."""
     try:
         detector = Detector(

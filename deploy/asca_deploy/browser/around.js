@@ -14,7 +14,7 @@ const NECK_STRIDE = 8;
  * `spec` of a bundle with ranges that reach in every direction as far as its own do in one; its own spec where the
  * graphs do not allow it, as those of a dense neck and those that were trained on a camera's view.
  */
-export function widened({ spec, pillar, expected_input: expected }) {
+export function widenRanges({ spec, pillar, expected_input: expected }) {
   const { grid, limits } = spec;
   if (pillar.neck !== "sparse" || expected.camera_view || grid.zones > 1) return spec;
   const reach = Math.max(...[...grid.x_range_m, ...grid.y_range_m].map(Math.abs));

@@ -1,6 +1,6 @@
 /** A bundle in ONNX Runtime: points in, boxes out. Knows no page, so that node runs it too. */
 
-import { aboutGround, turnsAround, widened } from "./around.js";
+import { aboutGround, turnsAround, widenRanges } from "./around.js";
 import { decodeCandidates, suppress } from "./boxes.js";
 import { changeBox, changePoints, inverse, turnBy } from "./frames.js";
 import { makeGrid, unseenDirections } from "./grid.js";
@@ -35,7 +35,7 @@ export class Detector {
 
   /** Where the model looks, and what it keeps from scan to scan: `spec`, `grid`, and `tables` or `canvas` of its neck. */
   field(around) {
-    const spec = around ? widened(this.manifest) : this.manifest.spec;
+    const spec = around ? widenRanges(this.manifest) : this.manifest.spec;
     const name = JSON.stringify(spec.grid);
     if (!this.fields.has(name)) {
       const { neck, channels, canvas, active_cells: rule } = this.manifest.pillar;

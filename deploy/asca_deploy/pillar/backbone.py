@@ -6,12 +6,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_pillars.detection.decode import HeadMaps
-from asca_pillars.ops.two_stage.first_stage import FirstPass
+from asca_pillars.ops.two_stage.first_stage import FirstStageOutputs
 
 Maps: TypeAlias = HeadMaps[NDArray[np.float32]]
 
 
-class HeadAnswer(NamedTuple):
+class HeadOutputs(NamedTuple):
     """Outputs of the head for one scan, as `decode` takes them."""
 
     maps: Maps
@@ -30,8 +30,8 @@ class PillarBackbone(Protocol):
     def place(self, pillar_features: NDArray[Any], cells: NDArray[np.int64]) -> Any:
         """Place pillar features (P, C), in the bundle's type, at flat cell indices (P,): the graph's input."""
 
-    def run(self, placed: Any) -> HeadAnswer:
+    def run(self, placed: Any) -> HeadOutputs:
         """Run the graph; each placed scan may be given once."""
 
-    def infer_with_neck(self, placed: Any) -> FirstPass:
+    def infer_with_neck(self, placed: Any) -> FirstStageOutputs:
         """Run the graph as `run` does, and return the head's input too; for graphs that a second stage follows."""

@@ -1,4 +1,4 @@
-"""The pillar family's pipeline: pillarize, encode, scatter or tables, neck and head, decode (paper section 3)."""
+"""The pillar family's pipeline: pillarize, encode, scatter or rulebooks, neck and head, decode (paper section 3)."""
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from asca_deploy import providers
 from asca_deploy.bundle import BACKBONE, NECK, CanvasFormat, PillarBundle
 from asca_deploy.graph import Session, check_interface
-from asca_deploy.pillar.backbone import HeadAnswer, Maps, PillarBackbone
+from asca_deploy.pillar.backbone import HeadOutputs, Maps, PillarBackbone
 from asca_deploy.pillar.graphs import PILLAR_FEATURES, backbone_interface, check_neck, open_encoder, output_channels
-from asca_deploy.pipeline import Laps, Pipeline
+from asca_deploy.pipeline import Pipeline, StageTimes
 from asca_pillars.base.kernels import load_kernels
 from asca_pillars.detection.decode import HeadMaps, decode
 from asca_pillars.detection.detections import Detections
@@ -21,7 +21,7 @@ from asca_pillars.ops.pillar.grid import PillarGrid, pool_pillars
 from asca_pillars.ops.pillar.neck_rulebooks import NeckRulebookBuilder, NeckRulebooks, rulebook_inputs
 from asca_pillars.ops.pillar.prepare import KERNELS, PillarCounts, Pillars, pillarize
 from asca_pillars.ops.pillar.spec import PillarSpec
-from asca_pillars.ops.two_stage.first_stage import FirstPass
+from asca_pillars.ops.two_stage.first_stage import FirstStageOutputs
 
 T = TypeVar("T")
 
@@ -65,27 +65,27 @@ class PillarPipeline:
         self.stages = ("pillarize", "encode", self.backbone.stage, "neck+head", "decode")
         self._anchors = self.spec.anchors
 
-    def prepare(self, points: NDArray[np.float32], laps: Laps) -> PreparedPillars:
+    def prepare(self, points: NDArray[np.float32], stage_times: StageTimes) -> PreparedPillars:
         """Prepare the backbone's input from points (N, 4), metres, LiDAR frame, and reflectance."""
         pillars = self.pillarize(points)
-        laps.append(("pillarize", perf_counter()))
+        stage_times.append(("pillarize", perf_counter()))
         features = self.encode(pillars)
-        laps.append(("encode", perf_counter()))
+        stage_times.append(("encode", perf_counter()))
         placed = self.backbone.place(features, pillars.cells)
-        laps.append((self.backbone.stage, perf_counter()))
+        stage_times.append((self.backbone.stage, perf_counter()))
         return PreparedPillars(placed, pillars.stats)
 
-    def infer(self, prepared: PreparedPillars, laps: Laps) -> HeadAnswer:
+    def infer(self, prepared: PreparedPillars, stage_times: StageTimes) -> HeadOutputs:
         """Run the backbone: head maps (channels, H, W) of logits and residuals, or rows of the active cells."""
         answer = self.backbone.run(prepared.placed)
-        laps.append(("neck+head", perf_counter()))
+        stage_times.append(("neck+head", perf_counter()))
         return answer
 
-    def finish(self, raw: HeadAnswer, laps: Laps) -> Detections:
+    def finish(self, raw: HeadOutputs, stage_times: StageTimes) -> Detections:
         """Decode head maps (channels, H, W) into boxes, LiDAR frame, by score thresholds and rotated NMS."""
         spec = self.spec
         detections = decode(raw.maps, self._anchors, spec.classes, spec.post, raw.cells, spec.direction_offset_rad)
-        laps.append(("decode", perf_counter()))
+        stage_times.append(("decode", perf_counter()))
         return detections
 
     def pillarize(self, points: NDArray[np.float32]) -> Pillars:
@@ -119,9 +119,9 @@ def open_backbone(
     in_steps = NECK in session.outputs and session.outputs[NECK].type == "uint8"
     check_interface(path, session, *backbone_interface(bundle, neck_channels, "uint8" if in_steps else "float32"))
     return (
-        CanvasBackbone(session, bundle)
+        DenseBackbone(session, bundle)
         if bundle.pillar.neck == "dense"
-        else TableBackbone(session, bundle, neck_channels)
+        else SparseBackbone(session, bundle, neck_channels)
     )
 
 
@@ -161,7 +161,7 @@ class Canvas:
         return self.image
 
 
-class CanvasBackbone:
+class DenseBackbone:
     """backbone.onnx of a dense neck, see `pillar.backbone.PillarBackbone`.
 
     Every scan between `place` and `run` has a canvas of its own, taken from those that are free. There are as many
@@ -181,23 +181,23 @@ class CanvasBackbone:
 
     def place(self, pillar_features: NDArray[Any], cells: NDArray[np.int64]) -> Canvas:
         """Place pillar features (P, C) at their cells, flat indices (P,), on a canvas that `run` gives back."""
-        canvas = take_free(self._free, self.new_canvas)
+        canvas = take_or_create(self._free, self.new_canvas)
         if self._pools:
             pillar_features, cells = pool_pillars(pillar_features, cells, self._bundle.spec.grid)
         canvas.scatter(pillar_features, cells)
         return canvas
 
-    def run(self, placed: Canvas) -> HeadAnswer:
+    def run(self, placed: Canvas) -> HeadOutputs:
         """Run the graph on the canvas: logits and residuals on the head's map."""
         maps = self.neck_and_head(placed.image)
         self._free.append(placed)
-        return HeadAnswer(maps, None)
+        return HeadOutputs(maps, None)
 
-    def infer_with_neck(self, placed: Canvas) -> FirstPass:
+    def infer_with_neck(self, placed: Canvas) -> FirstStageOutputs:
         """Run the graph as `run` does, and return the neck's map (H, W, C) too; for graphs with the output NECK."""
         *maps, neck = self._session.run((*HeadMaps._fields, NECK), {"canvas": placed.image})
         self._free.append(placed)
-        return FirstPass(channels_first(maps), neck[0])
+        return FirstStageOutputs(channels_first(maps), neck[0])
 
     def new_canvas(self) -> Canvas:
         """Return an empty canvas of this bundle's format."""
@@ -208,19 +208,19 @@ class CanvasBackbone:
         return channels_first(self._session.run(HeadMaps._fields, {"canvas": canvas}))
 
 
-class PlacedPillars(NamedTuple):
+class SparseBackboneInputs(NamedTuple):
     """Inputs of the graph for one scan."""
 
     features: NDArray[Any]
     """(P, C), or (cells, C) with a pooled map."""
-    tables: NeckRulebooks[NDArray[np.int32]]
+    rulebooks: NeckRulebooks[NDArray[np.int32]]
 
 
-class TableBackbone:
+class SparseBackbone:
     """backbone.onnx of a sparse neck, see `pillar.backbone.PillarBackbone`.
 
-    Tables are built in memory that is kept from scan to scan, as many builders as threads ever built at once; the
-    tables themselves belong to their scan.
+    Rulebooks are built in memory that is kept from scan to scan, as many builders as threads ever built at once; the
+    rulebooks themselves belong to their scan.
 
     Args:
         session: that has opened it, see `open_backbone`.
@@ -235,28 +235,28 @@ class TableBackbone:
         self._channels = output_channels(bundle, neck_channels)
         self._free = [self._new_builder()]
 
-    def place(self, pillar_features: NDArray[Any], cells: NDArray[np.int64]) -> PlacedPillars:
+    def place(self, pillar_features: NDArray[Any], cells: NDArray[np.int64]) -> SparseBackboneInputs:
         """Return pillar features (P, C) with the rulebooks of their cells, flat indices (P,)."""
-        builder = take_free(self._free, self._new_builder)
+        builder = take_or_create(self._free, self._new_builder)
         if self._pools:
             pillar_features, cells = pool_pillars(pillar_features, cells, self._bundle.spec.grid)
-        tables = builder.build(cells)
+        rulebooks = builder.build(cells)
         self._free.append(builder)
-        return PlacedPillars(pillar_features, tables)
+        return SparseBackboneInputs(pillar_features, rulebooks)
 
-    def run(self, placed: PlacedPillars) -> HeadAnswer:
+    def run(self, placed: SparseBackboneInputs) -> HeadOutputs:
         """Run the graph: scores (M, A), boxes (M, 7A), directions (M, 2A) at M active head cells."""
-        return HeadAnswer(HeadMaps(*self._rows(placed, HeadMaps._fields)), placed.tables.head_cells)
+        return HeadOutputs(HeadMaps(*self._rows(placed, HeadMaps._fields)), placed.rulebooks.head_cells)
 
-    def infer_with_neck(self, placed: PlacedPillars) -> FirstPass:
+    def infer_with_neck(self, placed: SparseBackboneInputs) -> FirstStageOutputs:
         """Run the graph as `run` does, and return the head's input (M, C) too; for graphs with the output NECK."""
         *maps, neck = self._rows(placed, (*HeadMaps._fields, NECK))
-        return FirstPass(HeadMaps(*maps), neck, placed.tables.head_cells)
+        return FirstStageOutputs(HeadMaps(*maps), neck, placed.rulebooks.head_cells)
 
-    def _rows(self, placed: PlacedPillars, names: Sequence[str]) -> list[NDArray[np.float32]]:
-        if not len(placed.tables.head_cells):
+    def _rows(self, placed: SparseBackboneInputs, names: Sequence[str]) -> list[NDArray[np.float32]]:
+        if not len(placed.rulebooks.head_cells):
             return [np.empty((0, self._channels[name]), np.float32) for name in names]
-        given = {PILLAR_FEATURES: placed.features, **rulebook_inputs(placed.tables)}
+        given = {PILLAR_FEATURES: placed.features, **rulebook_inputs(placed.rulebooks)}
         return run_graph(self._session, names, given)
 
     def _new_builder(self) -> NeckRulebookBuilder:
@@ -270,7 +270,7 @@ def run_graph(session: Session, outputs: Sequence[str], given: Mapping[str, NDAr
     return session.run(outputs, {name: given[name] for name in session.inputs})
 
 
-def take_free(free: list[T], make: Callable[[], T]) -> T:
+def take_or_create(free: list[T], make: Callable[[], T]) -> T:
     """Return a free item, or a new one; appending it to `free` gives it back."""
     try:
         return free.pop()  # atomic, as append is: two threads never get the same one
@@ -283,4 +283,4 @@ def channels_first(channels_last: Sequence[NDArray[Any]]) -> HeadMaps[NDArray[np
     return HeadMaps(*(maps[0].transpose(2, 0, 1) for maps in channels_last))
 
 
-_: type[Pipeline[PreparedPillars, HeadAnswer]] = PillarPipeline  # mypy compares them
+_: type[Pipeline[PreparedPillars, HeadOutputs]] = PillarPipeline  # mypy compares them

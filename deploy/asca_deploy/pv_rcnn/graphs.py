@@ -100,7 +100,7 @@ def deform_interface(bundle: PvRcnnBundle) -> Interface:
         inputs[f"{each.source}_positions"] = Tensor("float32", (None, 3))
         for number, samples in enumerate(each.samples):
             inputs[f"{each.source}_ball_{number}"] = Tensor("int32", (None, samples))
-        if settings.nearest_wanted:
+        if settings.needs_three_nearest:
             inputs[f"{each.source}_nearest"] = Tensor("int32", (None, 3))
             inputs[f"{each.source}_nearest_weights"] = Tensor("float32", (None, 3))
         for number in range(settings.places(each)):

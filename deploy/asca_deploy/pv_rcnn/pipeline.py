@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from asca_deploy import providers
 from asca_deploy.bundle import BACKBONE, DEFORM, KEYPOINTS, REFINE, VOXELS, PvRcnnBundle
 from asca_deploy.graph import Interface, Session, check_interface
-from asca_deploy.pillar.pipeline import channels_first, run_graph, take_free
-from asca_deploy.pipeline import Laps, Pipeline
+from asca_deploy.pillar.pipeline import channels_first, run_graph, take_or_create
+from asca_deploy.pipeline import Pipeline, StageTimes
 from asca_deploy.pv_rcnn.canvas import VoxelCanvas
 from asca_deploy.pv_rcnn.graphs import (
     OUT,
@@ -59,7 +59,7 @@ class PreparedVoxels(NamedTuple):
         return self.scan.counts
 
 
-class VoxelAnswer(NamedTuple):
+class VoxelOutputs(NamedTuple):
     """Outputs of the first stage for one scan."""
 
     scan: VoxelScan
@@ -122,62 +122,62 @@ class PvRcnnPipeline:
         self._canvases = [self._new_canvas()]
         self._builders = [self.spec.rulebook_builder()]
 
-    def prepare(self, points: NDArray[np.float32], laps: Laps) -> PreparedVoxels:
+    def prepare(self, points: NDArray[np.float32], stage_times: StageTimes) -> PreparedVoxels:
         """Prepare the bird's-eye-view map from points (N, 4), metres, LiDAR frame, and reflectance."""
         voxelized = self.voxelize(points)
-        laps.append(("voxelize", perf_counter()))
+        stage_times.append(("voxelize", perf_counter()))
         scan = with_neighbors(points, voxelized, self.spec, self.settings)
-        laps.append(("neighbors", perf_counter()))
+        stage_times.append(("neighbors", perf_counter()))
         if not len(scan.features):
             return PreparedVoxels(scan, {}, None)
         levels = self.encode(scan)
-        laps.append(("voxels", perf_counter()))
-        canvas = take_free(self._canvases, self._new_canvas)
+        stage_times.append(("voxels", perf_counter()))
+        canvas = take_or_create(self._canvases, self._new_canvas)
         canvas.scatter(levels.pop(OUT), scan.levels[-1].cells)
-        laps.append(("scatter", perf_counter()))
+        stage_times.append(("scatter", perf_counter()))
         return PreparedVoxels(scan, levels, canvas)
 
-    def infer(self, prepared: PreparedVoxels, laps: Laps) -> VoxelAnswer:
+    def infer(self, prepared: PreparedVoxels, stage_times: StageTimes) -> VoxelOutputs:
         """Run neck and head on the map; return the head maps, and the map's features at the keypoints."""
         scan, levels, canvas = prepared
         if canvas is None:
-            return VoxelAnswer(scan, levels, np.empty((0, self._map_channels), np.float32), None)
+            return VoxelOutputs(scan, levels, np.empty((0, self._map_channels), np.float32), None)
         maps = self.neck_and_head(canvas.image)
-        laps.append(("neck+head", perf_counter()))
+        stage_times.append(("neck+head", perf_counter()))
         bev = read_map(canvas.rows, scan.bev_cells, scan.bev_weights)
         self._canvases.append(canvas)
-        laps.append(("keypoints", perf_counter()))
-        return VoxelAnswer(scan, levels, bev, maps)
+        stage_times.append(("keypoints", perf_counter()))
+        return VoxelOutputs(scan, levels, bev, maps)
 
-    def finish(self, raw: VoxelAnswer, laps: Laps) -> Detections:
+    def finish(self, raw: VoxelOutputs, stage_times: StageTimes) -> Detections:
         """Decode proposals, refine them, and return the boxes that thresholds and rotated NMS keep."""
         if raw.maps is None:
             return Detections.empty(self.spec.class_names)
-        detections = reported_detections(*self.judge(raw.maps, raw, laps), self.spec, self.scores)
-        laps.append(("decode", perf_counter()))
+        detections = reported_detections(*self.propose_and_refine(raw.maps, raw, stage_times), self.spec, self.scores)
+        stage_times.append(("decode", perf_counter()))
         return detections
 
-    def judge(
-        self, maps: HeadMaps[NDArray[np.float32]], raw: VoxelAnswer, laps: Laps
+    def propose_and_refine(
+        self, maps: HeadMaps[NDArray[np.float32]], raw: VoxelOutputs, stage_times: StageTimes
     ) -> tuple[Detections, NDArray[np.float32], NDArray[np.float32]]:
         """Return the R proposals of head maps, and the second stage's logits (R,) and residuals (R, 7) for them."""
         proposals = propose_anchors(maps, self.spec, self.settings.proposals)
-        laps.append(("propose", perf_counter()))
+        stage_times.append(("propose", perf_counter()))
         places = self.deform(raw.scan, raw.levels)
-        laps.append(("keypoints", perf_counter()))
+        stage_times.append(("keypoints", perf_counter()))
         balls = balls_around(raw.scan, self.settings, places)
-        laps.append(("neighbors", perf_counter()))
+        stage_times.append(("neighbors", perf_counter()))
         features = self.encode_keypoints(raw.scan, raw.levels, raw.bev, places, balls)
-        laps.append(("keypoints", perf_counter()))
+        stage_times.append(("keypoints", perf_counter()))
         grid = grid_neighbors(raw.scan.keypoints, proposals.boxes, self.settings, self.settings.vector_cells)
-        laps.append(("neighbors", perf_counter()))
+        stage_times.append(("neighbors", perf_counter()))
         confidence, residuals = self.refine(raw.scan.keypoints, features, grid)
-        laps.append(("refine", perf_counter()))
+        stage_times.append(("refine", perf_counter()))
         return proposals, confidence, residuals
 
     def voxelize(self, points: NDArray[np.float32]) -> VoxelizedScan:
         """Voxelize points (N, 4), metres, LiDAR frame, and reflectance: the input of voxels.onnx."""
-        builder = take_free(self._builders, self.spec.rulebook_builder)
+        builder = take_or_create(self._builders, self.spec.rulebook_builder)
         voxelized = voxel_levels(points, self.spec, builder)
         self._builders.append(builder)
         return voxelized
@@ -236,4 +236,4 @@ class PvRcnnPipeline:
         return VoxelCanvas(self.spec.level_shapes[-1], self._map_channels, self._map_type)
 
 
-_: type[Pipeline[PreparedVoxels, VoxelAnswer]] = PvRcnnPipeline  # mypy compares them
+_: type[Pipeline[PreparedVoxels, VoxelOutputs]] = PvRcnnPipeline  # mypy compares them

@@ -19,16 +19,16 @@ from asca_deploy.detector import Detector
 from asca_deploy.open_model import RuntimeOptions, open_detector, track_thresholds
 from asca_deploy.recordings.journal import JOURNAL_FILE, Journal, ScanResult, is_journal
 from asca_deploy.recordings.results import (
-    Found,
+    FrameResult,
     JsonLines,
     KittiTracks,
     ResultFile,
     open_text,
-    said_of_stamps,
-    tracked,
+    timestamp_note,
+    track_results,
 )
 from asca_deploy.recordings.sequence_files import SequenceFiles
-from asca_deploy.result_files import ABOUT_FILE, KITTI_FILE, RUN_FILE, claim, remove_companions
+from asca_deploy.result_files import ABOUT_FILE, KITTI_FILE, RUN_FILE, remove_companions, require_own_results
 from asca_deploy.tracker import Tracker
 from asca_pillars.base.errors import ConfigError, ScanError
 from asca_pillars.base.extras import require
@@ -44,7 +44,7 @@ from asca_pillars.scans.recordings.images import NearestImages
 from asca_pillars.scans.recordings.odometry import Poses, read_poses
 from asca_pillars.scans.recordings.open_recording import open_recording, recording_files
 from asca_pillars.scans.recordings.recorded_scans import RecordedScan, RecordedScans
-from asca_pillars.scans.recordings.recording import listed
+from asca_pillars.scans.recordings.recording import topics_text
 from asca_pillars.scans.scan_settings import ScanSettings
 
 _PLAIN = RuntimeOptions()
@@ -163,7 +163,7 @@ def _detect(task: _Task, reading: ScanSettings, options: RuntimeOptions, reporte
     require("recordings")
     task.files.check((task.path, task.calib))
     calibration = None if task.calib is None else read_calibration(task.calib)
-    claim(task.out, {JOURNAL_FILE: is_journal})
+    require_own_results(task.out, {JOURNAL_FILE: is_journal})
     recording = open_recording(task.path)
     topic = recording.point_cloud_topic(task.topic)
     if task.odometry is not None and not task.track:
@@ -179,7 +179,7 @@ def _detect(task: _Task, reading: ScanSettings, options: RuntimeOptions, reporte
     mounting, said = scans.mounting(reading)
     images = None if task.files.rerun is None else NearestImages(recording, task.image_topic)
     if images is not None and images.topic is not None and images.others:
-        said.append(f"images: of {images.topic.name}; --image-topic takes others of {listed(images.others)}")
+        said.append(f"images: of {images.topic.name}; --image-topic takes others of {topics_text(images.others)}")
     for line in said:
         reporter.remark(line)
     births, weak = track_thresholds(options.bundle, task.score)
@@ -205,7 +205,7 @@ def _detect(task: _Task, reading: ScanSettings, options: RuntimeOptions, reporte
         if task.track:
             _check_times(times_ns, task, topic.name, poses, reporter)
         pose_at = None if poses is None else partial(_pose_of_scan, poses, mounting)
-        results = _with_points(tracked(journal, tracker, pose_at), scans if task.files.show_points else None)
+        results = _with_points(track_results(journal, tracker, pose_at), scans if task.files.show_points else None)
         opened = partial(task.files.open, detector=detector, times_ns=times_ns, pose_at=pose_at, images=images)
         scope = detector_scope(detector.spec, around=task.around)
         written, classes = _write(task, results, calibration, scope, about, opened)
@@ -229,7 +229,7 @@ class _Run:
     def __init__(self, detector: Detector, scans: RecordedScans, journal: Journal) -> None:
         self._detector, self._scans, self._journal = detector, scans, journal
         self._coming: deque[RecordedScan] = deque()
-        self.troubles = [one.trouble for one in journal.results() if one.trouble] if journal.done else []
+        self.error_texts = [one.error_text for one in journal.results() if one.error_text] if journal.done else []
         self.kept: list[DetectedScan] = []
 
     def results(self) -> Iterator[None]:
@@ -254,11 +254,11 @@ class _Run:
 
     def first(self) -> str:
         """Return the first reason why a scan was skipped, as the end of a sentence."""
-        return f": {self.troubles[0]}" if self.troubles else ""
+        return f": {self.error_texts[0]}" if self.error_texts else ""
 
     def skipped(self) -> list[str]:
         """Return a sentence on skipped scans, if there are any."""
-        return [f"{len(self.troubles)} scans were skipped{self.first()}"] if self.troubles else []
+        return [f"{len(self.error_texts)} scans were skipped{self.first()}"] if self.error_texts else []
 
     def _points(self) -> Iterator[NDArray[np.float32]]:
         first = next(number for number in count() if number not in self._journal)
@@ -273,14 +273,14 @@ class _Run:
         """Note the scans before the next one that could be read."""
         while self._coming and self._coming[0].scan is None:
             one = self._coming.popleft()
-            self.troubles.append(str(one.trouble))
-            self._journal.add(ScanResult(one.number, one.time_ns, one.frame_id, None, one.trouble))
+            self.error_texts.append(str(one.error_text))
+            self._journal.add(ScanResult(one.number, one.time_ns, one.frame_id, None, one.error_text))
             yield
 
 
 def _check_times(times: Sequence[int], task: _Task, topic: str, poses: Poses | None, reporter: Reporter) -> None:
     """Report stamps out of order or too short odometry; ScanError if the odometry is of another time."""
-    if stamps := said_of_stamps(times):
+    if stamps := timestamp_note(times):
         reporter.remark(f"{task.path}, {topic}: {stamps}")
     if poses is None:
         return
@@ -329,8 +329,8 @@ def _pose_of_scan(poses: Poses, mounting: Mounting, time_ns: int) -> NDArray[np.
 
 
 def _with_points(
-    results: Iterator[Found], scans: RecordedScans | None
-) -> Iterator[tuple[Found, NDArray[np.float32] | None]]:
+    results: Iterator[FrameResult], scans: RecordedScans | None
+) -> Iterator[tuple[FrameResult, NDArray[np.float32] | None]]:
     """Yield each result with the points of its scan, which is read once more; None without `scans`."""
     again = iter(()) if scans is None else scans.read()
     for found in results:
@@ -340,7 +340,7 @@ def _with_points(
 
 def _write(
     task: _Task,
-    results: Iterator[tuple[Found, NDArray[np.float32] | None]],
+    results: Iterator[tuple[FrameResult, NDArray[np.float32] | None]],
     calibration: Any,
     scope: DetectorScope,
     about: dict[str, Any],

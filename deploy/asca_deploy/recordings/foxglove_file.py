@@ -12,7 +12,7 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from asca_deploy.recordings.results import Found
+from asca_deploy.recordings.results import FrameResult
 from asca_pillars.pictures.colors import class_shares
 
 TOPIC = "/asca/boxes"
@@ -89,7 +89,7 @@ class FoxgloveFile:
         schema = self._writer.register_schema("foxglove.SceneUpdate", "jsonschema", json.dumps(SCHEMA).encode())
         self._channel = self._writer.register_channel(TOPIC, "json", schema)
 
-    def write(self, found: Found, points: NDArray[np.float32] | None = None) -> None:
+    def write(self, found: FrameResult, points: NDArray[np.float32] | None = None) -> None:
         """Write one message."""
         data = json.dumps(scene_update(found)).encode()
         self._writer.add_message(self._channel, found.time_ns, data, found.time_ns, found.number)
@@ -99,7 +99,7 @@ class FoxgloveFile:
         self._writer.finish()
 
 
-def scene_update(found: Found) -> dict[str, Any]:
+def scene_update(found: FrameResult) -> dict[str, Any]:
     """Return a scan's boxes as the fields of foxglove.SceneUpdate."""
     time = {"sec": found.time_ns // 10**9, "nsec": found.time_ns % 10**9}
     entities = []

@@ -17,7 +17,7 @@ import numpy as np
 
 from asca_deploy.result_files import COMMAND
 from asca_pillars.base.errors import OutputError
-from asca_pillars.base.files import atomic_path, sealed, unsealed
+from asca_pillars.base.files import add_checksum, atomic_path, verify_checksum
 from asca_pillars.base.locks import only_writer
 from asca_pillars.base.own_files import require_no_link
 from asca_pillars.detection.detections import Detections
@@ -34,14 +34,14 @@ class ScanResult(NamedTuple):
     time_ns: int
     frame_id: str
     detections: Detections | None
-    trouble: str | None = None
+    error_text: str | None = None
     dropped_points: int = 0
 
 
 def is_journal(path: Path) -> bool:
     """Return whether a file begins as a journal does."""
     with path.open("rb") as file:
-        return unsealed(file.readline(_LONGEST_HEAD_BYTES), _KEY) is not None
+        return verify_checksum(file.readline(_LONGEST_HEAD_BYTES), _KEY) is not None
 
 
 class Journal:
@@ -84,7 +84,7 @@ class Journal:
             kept = self._whole_lines()
             if kept is not None:  # written anew rather than cut
                 with atomic_path(self.path) as temporary, temporary.open("wb") as new:
-                    new.write(sealed(self._about, _KEY).encode())
+                    new.write(add_checksum(self._about, _KEY).encode())
                     new.writelines(self._lines(kept))
                 self._whole_lines()
             self._file = stack.enter_context(self.path.open("ab"))
@@ -101,11 +101,11 @@ class Journal:
         found = result.detections
         line: dict[str, Any] = {"number": result.number, "time_ns": result.time_ns, "frame_id": result.frame_id}
         if found is None:
-            line["trouble"] = result.trouble
+            line["trouble"] = result.error_text
         else:
             line |= {"boxes": found.boxes.tolist(), "scores": found.scores.tolist(), "labels": found.labels.tolist()}
             line["dropped_points"] = result.dropped_points
-        content = sealed(json.dumps(line), self._about).encode()
+        content = add_checksum(json.dumps(line), self._about).encode()
         try:
             self._file.write(content)
             self._file.flush()
@@ -117,7 +117,7 @@ class Journal:
     def results(self) -> Iterator[ScanResult]:
         """Yield all results in the order of the messages."""
         for line in self._lines([self._starts[number] for number in sorted(self._starts)]):
-            text = unsealed(line, self._about)
+            text = verify_checksum(line, self._about)
             if text is None:
                 raise OutputError(f"{self.path}: was changed while it was written; give the same command again")
             yield self._result(json.loads(text))
@@ -137,13 +137,13 @@ class Journal:
             return []
         with self.path.open("rb") as file:
             first = file.readline()
-            before = unsealed(first, _KEY)
+            before = verify_checksum(first, _KEY)
             if before != self._about:
                 self.differs = _first_difference(json.loads(before or "{}"), json.loads(self._about))
                 return []
             self._end, whole = len(first), True
             for line in file:
-                text = unsealed(line, self._about)
+                text = verify_checksum(line, self._about)
                 if text is None:
                     whole = False
                 else:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from asca_deploy.recordings.results import Found
+from asca_deploy.recordings.results import FrameResult
 from asca_pillars.pictures.colors import class_rgb, ground_height, height_rgb
 from asca_pillars.scans.recordings.images import CameraImage, NearestImages
 
@@ -52,16 +52,16 @@ class RerunFile:
         self._failed = False
         self._ground_m: float | None = None
 
-    def write(self, found: Found, points: NDArray[np.float32] | None) -> None:
+    def write(self, found: FrameResult, points: NDArray[np.float32] | None) -> None:
         """Write one scan with its boxes."""
         assert points is not None, "it shows points"
         rr, stream = self._rr, self._stream
         stream.set_time(TIMELINE, timestamp=np.datetime64(found.time_ns, "ns"))
-        shown = points[:: -(-len(points) // MAX_POINTS) or 1]
+        subset = points[:: -(-len(points) // MAX_POINTS) or 1]
         if self._ground_m is None and len(points):
             self._ground_m = ground_height(points[:, 2])  # once: colors do not flicker
-        colors = height_rgb(shown[:, 2], self._ground_m or 0.0)
-        stream.log("scan", rr.Points3D(shown[:, :3], colors=colors, radii=0.03))
+        colors = height_rgb(subset[:, 2], self._ground_m or 0.0)
+        stream.log("scan", rr.Points3D(subset[:, :3], colors=colors, radii=0.03))
         stream.log("boxes", self._boxes(found))
         if found.tracks is not None:
             stream.log("velocities", self._velocities(found))
@@ -98,8 +98,8 @@ class RerunFile:
 
     def _show(self, image: CameraImage | None) -> None:
         """Log an image that is not shown already; None: the one that is shown goes."""
-        shown, self._image = self._image, image
-        if image is shown:
+        previous, self._image = self._image, image
+        if image is previous:
             return
         if image is None:
             self._stream.log(_CAMERA, self._rr.Clear(recursive=False))
@@ -108,7 +108,7 @@ class RerunFile:
         else:
             self._stream.log(_CAMERA, self._rr.Image(image.content, color_model=image.kind))
 
-    def _velocities(self, found: Found) -> Any:
+    def _velocities(self, found: FrameResult) -> Any:
         """Return an arrow for each moving track, as long as its way of one second, from the center of its roof."""
         assert found.tracks is not None
         moving = np.hypot(*found.tracks.velocities_mps.T) > MOVES_MPS
@@ -120,10 +120,10 @@ class RerunFile:
             radii=0.06,
         )
 
-    def _colors(self, found: Found) -> NDArray[np.uint8]:
+    def _colors(self, found: FrameResult) -> NDArray[np.uint8]:
         return np.array([class_rgb(name) for name in found.detections.names], np.uint8).reshape(-1, 3)
 
-    def _boxes(self, found: Found) -> Any:
+    def _boxes(self, found: FrameResult) -> Any:
         rr, boxes = self._rr, found.detections.boxes
         half: NDArray[np.float64] = boxes[:, 6].astype(np.float64) / 2
         quaternions = np.stack([0 * half, 0 * half, np.sin(half), np.cos(half)], axis=1)

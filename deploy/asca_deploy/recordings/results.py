@@ -21,7 +21,7 @@ from asca_pillars.geometry.frame_change import FrameChange
 _MIRROR = FrameChange(np.diag([1.0, -1.0, 1.0]), np.zeros(3))
 
 
-class Found(NamedTuple):
+class FrameResult(NamedTuple):
     """Boxes of one scan as they are written; `tracks` is None without tracking."""
 
     number: int
@@ -35,13 +35,13 @@ class Found(NamedTuple):
 class ResultFile(Protocol):
     """Output of results, one scan after the other."""
 
-    def write(self, found: Found, points: NDArray[np.float32] | None) -> None:
+    def write(self, found: FrameResult, points: NDArray[np.float32] | None) -> None:
         """Write the next scan, and its points (N, 4) where some file of the run draws them."""
 
 
-def tracked(
+def track_results(
     journal: Journal, tracker: Tracker | None, pose_at: Callable[[int], NDArray[np.float64]] | None = None
-) -> Iterator[Found]:
+) -> Iterator[FrameResult]:
     """Yield the results of a journal, in its order, with identities if there is a tracker; not those that were skipped.
 
     Args:
@@ -50,7 +50,7 @@ def tracked(
         pose_at: from a time, nanoseconds, to the (4, 4) pose of the scan, metres; None: unknown.
     """
     found = (
-        Found(one.number, one.time_ns, one.frame_id, one.detections, None, one.dropped_points)
+        FrameResult(one.number, one.time_ns, one.frame_id, one.detections, None, one.dropped_points)
         for one in journal.results()
         if one.detections is not None
     )
@@ -65,7 +65,7 @@ def tracked(
     yield from results
 
 
-def _track(tracker: Tracker, found: Found, pose: NDArray[np.float64] | None) -> Tracks:
+def _track(tracker: Tracker, found: FrameResult, pose: NDArray[np.float64] | None) -> Tracks:
     """Track the next scan; mirrored, if its frame is a mirror image, as its pose is then no rotation."""
     time_s = found.time_ns * 1e-9
     if pose is None or np.linalg.det(pose[:3, :3]) > 0:
@@ -92,7 +92,7 @@ def tracking_order(times_ns: Sequence[int]) -> list[int]:
     return [int(index) for index in np.lexsort((times, np.cumsum(begins)))]
 
 
-def said_of_stamps(times_ns: Sequence[int]) -> str | None:
+def timestamp_note(times_ns: Sequence[int]) -> str | None:
     """Return a sentence if stamps of recorded scans go back, or on by more than the pause that ends tracks."""
     steps = np.diff(np.array(times_ns, np.int64))
     back, ahead = int((steps < 0).sum()), int((steps > round(MAX_SCAN_GAP_S * 1e9)).sum())
@@ -110,7 +110,7 @@ class JsonLines:
     def __init__(self, file: IO[str], recording: str, scope: DetectorScope) -> None:
         self._file, self._recording, self._detector = file, recording, scope.to_json()
 
-    def write(self, found: Found, points: NDArray[np.float32] | None = None) -> None:
+    def write(self, found: FrameResult, points: NDArray[np.float32] | None = None) -> None:
         """Write one line."""
         boxes = found.detections.to_dicts() if found.tracks is None else found.tracks.to_dicts()
         line = {
@@ -131,7 +131,7 @@ class KittiTracks:
     def __init__(self, file: IO[str], calibration: Calibration) -> None:
         self._file, self._calibration = file, calibration
 
-    def write(self, found: Found, points: NDArray[np.float32] | None = None) -> None:
+    def write(self, found: FrameResult, points: NDArray[np.float32] | None = None) -> None:
         """Write the lines of one scan."""
         boxes = found.detections
         objects = objects_from_boxes(boxes.boxes, boxes.names, self._calibration, DEFAULT_IMAGE_SIZE_WH, boxes.scores)

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from asca_deploy.recordings.results import Found
+from asca_deploy.recordings.results import FrameResult
 from asca_deploy.result_files import COMMAND
 from asca_pillars.base.errors import ConfigError
 from asca_pillars.base.writable_file import require_suffix, require_writable
@@ -66,7 +66,7 @@ class RecordingVideo:
         self._file, self._pose_at = VideoFile(path, rate_hz), pose_at
         self._video = BoxVideo(self._file, view, ranges, level)
 
-    def write(self, found: Found, points: NDArray[np.float32] | None) -> None:
+    def write(self, found: FrameResult, points: NDArray[np.float32] | None) -> None:
         """Write one picture."""
         assert points is not None, "it shows points"
         ids = None if found.tracks is None else found.tracks.track_ids

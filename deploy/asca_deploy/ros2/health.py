@@ -27,7 +27,7 @@ class Health:
     lost: int = 0
     """Messages reported lost by the middleware."""
     unreadable: int = 0
-    trouble: str | None = None
+    error_text: str | None = None
     """Reason why the last unreadable one could not be read."""
     warnings: tuple[str, ...] = ()
     """Warnings of the last answered scan."""
@@ -39,22 +39,22 @@ class Health:
     """Boxes by class, of the same scans."""
     _last_message_s: float = field(default_factory=monotonic)
     _since: tuple[float, int] = field(default_factory=lambda: (monotonic(), 0))
-    _told: tuple[int, int, int] = (0, 0, 0)
+    _last_reported: tuple[int, int, int] = (0, 0, 0)
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
-    def take(self) -> None:
+    def count_received(self) -> None:
         """Count a received message."""
         with self._lock:
             self.received += 1
             self._last_message_s = monotonic()
 
-    def refuse(self, why: str) -> None:
+    def count_unreadable(self, why: str) -> None:
         """Count a message that could not be read."""
         with self._lock:
             self.unreadable += 1
-            self.trouble = why
+            self.error_text = why
 
-    def answer(self, latency_ms: float, names: list[str], warnings: tuple[str, ...]) -> None:
+    def count_answered(self, latency_ms: float, names: list[str], warnings: tuple[str, ...]) -> None:
         """Count a scan answered with boxes of these classes."""
         with self._lock:
             self.answered += 1
@@ -87,8 +87,8 @@ class Health:
     def status(self, topic: str, publishers: int) -> tuple[int, str]:
         """Return a level of diagnostics and a sentence about the time since the last call."""
         with self._lock:
-            before, self._told = self._told, (self.dropped, self.lost, self.unreadable)
-            dropped, lost, unreadable = (now - then for now, then in zip(self._told, before, strict=True))
+            before, self._last_reported = self._last_reported, (self.dropped, self.lost, self.unreadable)
+            dropped, lost, unreadable = (now - then for now, then in zip(self._last_reported, before, strict=True))
             quiet_s = monotonic() - self._last_message_s
             if self.failure:
                 return ERROR, self.failure
@@ -97,7 +97,7 @@ class Health:
             if quiet_s > _QUIET_S:
                 return WARN, f"no scan on {topic} for {quiet_s:.0f} s"
             if unreadable:
-                return WARN, f"{unreadable} scans could not be read: {self.trouble}"
+                return WARN, f"{unreadable} scans could not be read: {self.error_text}"
             if dropped or lost:
                 return WARN, f"{dropped} scans dropped for later ones, {lost} lost on the way"
             if self.warnings:

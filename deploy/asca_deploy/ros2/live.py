@@ -43,7 +43,7 @@ class _Taken:
     at_s: float
 
 
-class Live:
+class LiveDetection:
     """Live detection: a queue that one thread fills with clouds, and a detector that another runs (`run`).
 
     Args:
@@ -93,10 +93,10 @@ class Live:
         """Name of the model."""
         return self._detector.bundle.name
 
-    def take(self, cloud: Any) -> None:
+    def enqueue(self, cloud: Any) -> None:
         """Enqueue a `sensor_msgs/PointCloud2`, or an object like it; a full queue drops its oldest scan."""
         at_s = monotonic()
-        self.health.take()
+        self.health.count_received()
         stamp = stamp_of(cloud.header)
         try:
             if self._frame_id is not None and stamp.frame_id != self._frame_id:
@@ -105,7 +105,7 @@ class Live:
         except AscaError as error:
             if not self.health.unreadable:
                 self._log("unreadable", trouble=str(error), said="once; diagnostics count the others")
-            self.health.refuse(str(error))
+            self.health.count_unreadable(str(error))
             return
         self._queue.put(points, _Taken(stamp, at_s))
         self.health.dropped = self._queue.dropped
@@ -118,14 +118,14 @@ class Live:
             for points in self._queue:
                 taken: _Taken = self._queue.next_tag()
                 self._working_since = monotonic()
-                # One scan at a time: a stream would take two more ahead, which answers more scans, each later.
+                # One scan at a time: a stream takes two more ahead, so that each answer would be later.
                 found = self._detector(points)
                 boxes: ScanDetections | Tracks = found
                 if self._tracker is not None:
                     boxes = self._tracker(found, taken.stamp.seconds or taken.at_s)
                 self._answer(taken.stamp, boxes)
                 names = boxes.detections.names if isinstance(boxes, Tracks) else boxes.names
-                self.health.answer(1e3 * (monotonic() - taken.at_s), names, found.report.warnings)
+                self.health.count_answered(1e3 * (monotonic() - taken.at_s), names, found.report.warnings)
                 self._working_since = None
         except BaseException as error:
             self.health.failure = str(error) or type(error).__name__

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_deploy.detector import Detector
-from asca_deploy.ros2.live import Live
+from asca_deploy.ros2.live import LiveDetection
 from asca_deploy.ros2.messages import (
     Stamp,
     detection_array,
@@ -48,7 +48,7 @@ class NodeSettings:
 
     Attributes:
         topic: of `sensor_msgs/PointCloud2`.
-        reading: as `Live`.
+        reading: as `LiveDetection`.
         qos: of the subscription; "auto": as the publishers offer, see `reliability`.
         frame: the frame of the vehicle, x forward, y left, z up, to which TF says how the scans lie; None: the mounting
             of `reading` says it.
@@ -127,7 +127,7 @@ def run_node(
             if (live.health.answered + 1) % settings.log_every == 0:
                 log("scans", **live.health.summary())
 
-        live = Live(open_detector, settings.reading, answer, log, tracker=tracker, pose_of=pose_of)
+        live = LiveDetection(open_detector, settings.reading, answer, log, tracker=tracker, pose_of=pose_of)
         if stop.is_set():
             return
         rclpy.init(args=["asca", *settings.ros_args], signal_handler_options=rclpy.signals.SignalHandlerOptions.NO)
@@ -140,7 +140,7 @@ def run_node(
             rclpy.try_shutdown()
 
 
-def _spin(rclpy: Any, node: "_Node", live: Live, stop: threading.Event) -> None:
+def _spin(rclpy: Any, node: "_Node", live: LiveDetection, stop: threading.Event) -> None:
     failures: list[BaseException] = []
 
     def work() -> None:
@@ -177,7 +177,7 @@ def _spin(rclpy: Any, node: "_Node", live: Live, stop: threading.Event) -> None:
 class _Node:
     """Connection to ROS: the subscription, which follows the publishers, and the answers."""
 
-    def __init__(self, rclpy: Any, settings: NodeSettings, live: Live, transforms: Transforms) -> None:
+    def __init__(self, rclpy: Any, settings: NodeSettings, live: LiveDetection, transforms: Transforms) -> None:
         self._rclpy, self._settings, self._live = rclpy, settings, live
         self.node = rclpy.create_node("asca")
         self.topic, self.qos = self.node.resolve_topic_name(settings.topic), settings.qos
@@ -194,7 +194,7 @@ class _Node:
             self.node.create_subscription(kind, "/tf_static", transforms.add, still)
         self._follow()
         self.node.create_timer(_LOOK_S, self._follow)
-        self.node.create_timer(_STATUS_S, self._tell)
+        self.node.create_timer(_STATUS_S, self._publish_diagnostics)
 
     def publishers(self) -> list[Callable[[Stamp, ScanDetections | Tracks], None]]:
         """Return the publishers of the boxes of a scan."""
@@ -235,21 +235,21 @@ class _Node:
             "reliable" if one.qos_profile.reliability == qos.ReliabilityPolicy.RELIABLE else "best_effort"
             for one in self.node.get_publishers_info_by_topic(self.topic)
         ]
-        wanted = reliability(offered, self._settings.qos)
-        if wanted is None or wanted == self._reliability:
+        requested = reliability(offered, self._settings.qos)
+        if requested is None or requested == self._reliability:
             return
         if self._subscription is not None:
             self.node.destroy_subscription(self._subscription)
-        profile = qos.QoSProfile(depth=_DEPTH, reliability=getattr(qos.ReliabilityPolicy, wanted.upper()))
+        profile = qos.QoSProfile(depth=_DEPTH, reliability=getattr(qos.ReliabilityPolicy, requested.upper()))
         self._subscription = self.node.create_subscription(
             message_type("sensor_msgs/PointCloud2"),
             self.topic,
-            self._live.take,
+            self._live.enqueue,
             profile,
             event_callbacks=self._events(),
         )
-        self._reliability = wanted
-        log("subscribed", topic=self.topic, reliability=wanted, publishers=len(offered))
+        self._reliability = requested
+        log("subscribed", topic=self.topic, reliability=requested, publishers=len(offered))
 
     def _events(self) -> Any:
         """Return the callbacks for events of the middleware."""
@@ -260,7 +260,7 @@ class _Node:
 
         return SubscriptionEventCallbacks(message_lost=lost, use_default_callbacks=True)
 
-    def _tell(self) -> None:
+    def _publish_diagnostics(self) -> None:
         level, message = self._live.health.status(self.topic, self.node.count_publishers(self.topic))
         if not self._diagnostics.get_subscription_count():
             return

@@ -13,7 +13,7 @@ from asca_deploy import providers
 from asca_deploy.bundle import REFINE, PillarBundle, RefineSection
 from asca_deploy.graph import Interface, Session, Tensor, check_interface
 from asca_deploy.pillar.pipeline import PillarPipeline, PreparedPillars, run_graph
-from asca_deploy.pipeline import Laps, Pipeline
+from asca_deploy.pipeline import Pipeline, StageTimes
 from asca_pillars.base.errors import BundleError
 from asca_pillars.base.kernels import load_kernels
 from asca_pillars.detection.detections import Detections
@@ -22,7 +22,7 @@ from asca_pillars.ops.pillar.spec import PillarSpec
 from asca_pillars.ops.points import neighbors, sampling
 from asca_pillars.ops.points.ball_layouts import BallGroup, GroupedBalls, gather_balls, group_balls, group_widths
 from asca_pillars.ops.two_stage.decode import reported_detections
-from asca_pillars.ops.two_stage.first_stage import FirstPass, proposed_from
+from asca_pillars.ops.two_stage.first_stage import FirstStageOutputs, second_stage_inputs
 from asca_pillars.ops.two_stage.prepare import ROI_FEATURES, RefineScan, refine_scan
 
 OUTPUTS = ("confidence", "residuals")
@@ -41,10 +41,10 @@ class PreparedScan(NamedTuple):
         return self.pillars.counts
 
 
-class FirstAnswer(NamedTuple):
+class FirstStageResult(NamedTuple):
     """Outputs of the first stage for one scan."""
 
-    found: FirstPass
+    found: FirstStageOutputs
     points: NDArray[np.float32]
 
 
@@ -88,27 +88,27 @@ class RefinePipeline:
         self._second: Session = check_interface(path, session, inputs, outputs)
         self._executor = ThreadPoolExecutor(1) if threads > 1 else None
 
-    def prepare(self, points: NDArray[np.float32], laps: Laps) -> PreparedScan:
+    def prepare(self, points: NDArray[np.float32], stage_times: StageTimes) -> PreparedScan:
         """Prepare the input of the first stage's backbone from points (N, 4)."""
-        return PreparedScan(self.first.prepare(points, laps), points)
+        return PreparedScan(self.first.prepare(points, stage_times), points)
 
-    def infer(self, prepared: PreparedScan, laps: Laps) -> FirstAnswer:
+    def infer(self, prepared: PreparedScan, stage_times: StageTimes) -> FirstStageResult:
         """Run the first stage's backbone: head maps and the neck's map, or rows of both."""
         found = self.first.backbone.infer_with_neck(prepared.pillars.placed)
-        laps.append(("neck+head", perf_counter()))
-        return FirstAnswer(found, prepared.points)
+        stage_times.append(("neck+head", perf_counter()))
+        return FirstStageResult(found, prepared.points)
 
-    def finish(self, raw: FirstAnswer, laps: Laps) -> Detections:
+    def finish(self, raw: FirstStageResult, stage_times: StageTimes) -> Detections:
         """Decode proposals, refine them, and return the boxes that thresholds and rotated NMS keep."""
-        proposed = proposed_from(raw.found, raw.points, self.spec, self.section.seen)
-        laps.append(("propose", perf_counter()))
+        proposed = second_stage_inputs(raw.found, raw.points, self.spec, self.section.seen)
+        stage_times.append(("propose", perf_counter()))
         scan = refine_scan(raw.points, proposed, proposed.proposals, self.section.neighbors, self._executor)
         inputs = refine_inputs(scan)
-        laps.append(("neighbors", perf_counter()))
+        stage_times.append(("neighbors", perf_counter()))
         confidence, residuals = self.refine(inputs)
-        laps.append(("refine", perf_counter()))
+        stage_times.append(("refine", perf_counter()))
         detections = reported_detections(proposed.proposals, confidence, residuals, self.spec, self.section.scores)
-        laps.append(("decode", perf_counter()))
+        stage_times.append(("decode", perf_counter()))
         return detections
 
     def refine(self, inputs: Mapping[str, NDArray[Any]]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
@@ -155,4 +155,4 @@ def refine_interface(section: RefineSection, classes: int) -> Interface:
     return inputs, {"confidence": Tensor("float32", (None,)), "residuals": Tensor("float32", (None, 7))}
 
 
-_: type[Pipeline[PreparedScan, FirstAnswer]] = RefinePipeline  # mypy compares them
+_: type[Pipeline[PreparedScan, FirstStageResult]] = RefinePipeline  # mypy compares them

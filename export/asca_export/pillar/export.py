@@ -9,11 +9,11 @@ from numpy.typing import NDArray
 from asca_deploy.bundle import BACKBONE, BUNDLE_FOLDER, ENCODER, CanvasFormat, Parity, PillarBundle, PillarSection
 from asca_deploy.pillar.pipeline import PillarPipeline
 from asca_export import graphs
+from asca_export.bundle_writer import DEFAULTS, ExportOptions, draft_bundle, require_parity_scans, write_bundle
 from asca_export.fast_forms import FastBackbone, fast_encoder
 from asca_export.int8 import calibration_scans, quantize_bundle
-from asca_export.parity import prove_parity
+from asca_export.parity import check_parity
 from asca_export.pillar.masked_forms import MarkedEncoder, MaskedBackbone
-from asca_export.proven_bundle import DEFAULTS, ExportOptions, draft_bundle, require_parity_scans, write_proven
 from asca_export.sparse_forms import SparseBackbone, export_sparse_backbone, sparse_multiply_accumulates
 from asca_pillars.base.errors import ExportError
 from asca_pillars.base.files import atomic_directory
@@ -46,10 +46,10 @@ def export_pillar_bundle(
             PillarBundle, model.spec, checkpoint, scans, options, kind="pillar", pillar=section, backbone_gmac=gmac
         )
 
-        def prove(opened: PillarBundle) -> Parity:
-            return prove_parity(detector, PillarPipeline(folder, opened, threads=default_threads()), scans)
+        def compare(opened: PillarBundle) -> Parity:
+            return check_parity(detector, PillarPipeline(folder, opened, threads=default_threads()), scans)
 
-        bundle = write_proven(folder, draft, prove, options.weights)
+        bundle = write_bundle(folder, draft, compare, options.weights)
         if calibration is not None:
             bundle = quantize_bundle(folder, bundle, detector, calibration, scans, options.progress)
     return bundle
@@ -83,5 +83,5 @@ def _export_graphs(
         return graphs.multiply_accumulates(path) / 1e9
     backbone = SparseBackbone(detector)
     export_sparse_backbone(backbone, path)
-    tables = [preparation.place(preparation.spec.pillarize(scan)).tables for scan in scans]
-    return float(np.mean([sparse_multiply_accumulates(backbone, each) for each in tables if each is not None])) / 1e9
+    rulebooks = [preparation.place(preparation.spec.pillarize(scan)).rulebooks for scan in scans]
+    return float(np.mean([sparse_multiply_accumulates(backbone, each) for each in rulebooks if each is not None])) / 1e9

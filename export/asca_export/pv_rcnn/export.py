@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 from asca_deploy.bundle import BACKBONE, BUNDLE_FOLDER, Parity, PvRcnnBundle, PvRcnnSection
 from asca_deploy.pv_rcnn.pipeline import PvRcnnPipeline
 from asca_export import graphs
+from asca_export.bundle_writer import DEFAULTS, ExportOptions, draft_bundle, require_parity_scans, write_bundle
 from asca_export.int8 import calibration_scans
-from asca_export.proven_bundle import DEFAULTS, ExportOptions, draft_bundle, require_parity_scans, write_proven
 from asca_export.pv_rcnn.graphs import export_pv_rcnn_graphs
 from asca_export.pv_rcnn.int8 import quantize_pv_rcnn_bundle, require_quantizable
-from asca_export.pv_rcnn.parity import prove_pv_rcnn_parity
+from asca_export.pv_rcnn.parity import check_pv_rcnn_parity
 from asca_pillars.base.files import atomic_directory
 from asca_pillars.base.system import default_threads
 from asca_pillars.config.pv_rcnn import PvRcnnModel
@@ -48,11 +48,11 @@ def export_pv_rcnn_bundle(
         export_pv_rcnn_graphs(detector.network, draft, folder)
         gmac = graphs.multiply_accumulates(graphs.graph_path(folder, BACKBONE)) / 1e9
 
-        def prove(opened: PvRcnnBundle) -> Parity:
+        def compare(opened: PvRcnnBundle) -> Parity:
             pipeline = PvRcnnPipeline(folder, opened, threads=default_threads())
-            return prove_pv_rcnn_parity(detector.network, pipeline, scans)
+            return check_pv_rcnn_parity(detector.network, pipeline, scans)
 
-        bundle = write_proven(folder, dataclasses.replace(draft, backbone_gmac=gmac), prove, options.weights)
+        bundle = write_bundle(folder, dataclasses.replace(draft, backbone_gmac=gmac), compare, options.weights)
         if calibration is not None:
             bundle = quantize_pv_rcnn_bundle(folder, bundle, detector.network, calibration, scans, options.progress)
     return bundle

@@ -113,7 +113,7 @@ class _Deform(nn.Module):
         for each in self.settings.deformed:
             features, positions = next(left), next(left)
             balls = [next(left) for _ in each.radii_m]
-            nearest = (next(left), next(left)) if self.settings.nearest_wanted else ()
+            nearest = (next(left), next(left)) if self.settings.needs_three_nearest else ()
             places += self.deform[each.source](Surroundings(features, positions, keypoints, balls, *nearest))
         return tuple(places)
 

@@ -24,7 +24,7 @@ RELATIVE_TOLERANCE = 1e-4  # of a graph's outputs, relative to their largest val
 Array = NDArray[np.float32]
 
 
-def prove_pv_rcnn_parity(network: PvRcnn, runtime: PvRcnnPipeline, scans: Sequence[Array]) -> Parity:
+def check_pv_rcnn_parity(network: PvRcnn, runtime: PvRcnnPipeline, scans: Sequence[Array]) -> Parity:
     """Compare every stage in PyTorch with the exported graph on what PyTorch gave for the stage before.
 
     A proposal that one side has and the other lacks, by a tie between scores, would hide what a graph does.
@@ -82,7 +82,7 @@ def prove_pv_rcnn_parity(network: PvRcnn, runtime: PvRcnnPipeline, scans: Sequen
 def _places(network: PvRcnn, batch: VoxelBatch[torch.Tensor], levels: Sequence[torch.Tensor]) -> dict[str, Array]:
     """Return PyTorch's shifted keypoints by the names of the graph's outputs."""
     with torch.inference_mode():
-        places = network.deformed_places(batch, levels)
+        places = network.deformed_positions(batch, levels)
     return {f"{name}_place_{number}": each.numpy() for name, own in places.items() for number, each in enumerate(own)}
 
 

@@ -30,7 +30,7 @@ class VoxelSample(NamedTuple):
 
     features: Tensor
     """(N, 4) of the voxels, metres and reflectance."""
-    tables: Mapping[str, Tensor]
+    rulebooks: Mapping[str, Tensor]
     """Rulebooks by the names of the graph's inputs."""
 
 
@@ -73,11 +73,11 @@ class VoxelProducts(nn.Module):
         """Return the name of the last layer of this level."""
         return [layer.name for layer in self.layers if layer.level == level][-1]
 
-    def passes(self, features: Tensor, tables: Mapping[str, Tensor]) -> Iterator[tuple[str, Tensor, Tensor]]:
+    def passes(self, features: Tensor, rulebooks: Mapping[str, Tensor]) -> Iterator[tuple[str, Tensor, Tensor]]:
         """Yield name, input (M, taps * C) and output (M, outputs) of each product in turn, mostly unitless."""
         for layer in self.layers:
             padded = torch.cat([features, features.new_zeros(1, features.shape[1])])
-            read = padded[tables[layer.table].long()].flatten(1)
+            read = padded[rulebooks[layer.table].long()].flatten(1)
             features = torch.relu(self.product(layer.name)(read))
             yield layer.name, read, features
 
@@ -139,7 +139,7 @@ def export_voxels(
     eight_bit: Collection[str] = (),
     steps: Mapping[str, Tensor] | None = None,
 ) -> None:
-    """Write voxels.onnx: voxel features (N, 4) and the int32 tables -> features (M, C) of every level that is read.
+    """Write voxels.onnx: voxel features (N, 4) and the int32 rulebooks -> features (M, C) of every level that is read.
 
     Args:
         backbone: scaled to steps, if there are `steps`.
@@ -149,7 +149,7 @@ def export_voxels(
         steps: rows behind the first product are uint8, a step worth this (C,), unitless.
     """
     graph, counted = RowGraph(backbone.product, eight_bit), steps is not None
-    rows = graph.take("features", TensorProto.FLOAT, "voxels", VOXEL_VALUES)
+    rows = graph.add_input("features", TensorProto.FLOAT, "voxels", VOXEL_VALUES)
     missing = np.zeros(VOXEL_VALUES, np.float32)
     for number, layer in enumerate(backbone.layers):
         product = backbone.product(layer.name)
@@ -165,7 +165,7 @@ def export_voxels(
             factors = graph.constant(layer.name, "factors", (steps[layer.name] / STEP_VALUE).numpy())
             graph.named("Mul", [layer.level], graph.in_float(layer.name, "level", rows), factors)
         kind = TensorProto.UINT8 if counted and layer.level == OUT else TensorProto.FLOAT
-        graph.give(layer.level, kind, f"{layer.level}_voxels", product.out_features)
+        graph.add_output(layer.level, kind, f"{layer.level}_voxels", product.out_features)
     graph.save(path, "voxels")
 
 

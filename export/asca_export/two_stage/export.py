@@ -16,9 +16,9 @@ from asca_deploy.manifest import load_pillar_bundle
 from asca_deploy.shipped import find_bundle
 from asca_deploy.two_stage.pipeline import RefinePipeline
 from asca_export import graphs
+from asca_export.bundle_writer import DEFAULTS, ExportOptions, draft_bundle, require_parity_scans, write_bundle
 from asca_export.int8 import MAX_LOGIT_ERROR, calibration_scans, logit_error, write_quantized
 from asca_export.pillar.export import export_pillar_bundle
-from asca_export.proven_bundle import DEFAULTS, ExportOptions, draft_bundle, require_parity_scans, write_proven
 from asca_export.two_stage.first_stage import (
     BundleFirstStage,
     add_neck_output,
@@ -28,7 +28,7 @@ from asca_export.two_stage.first_stage import (
     scale_bev,
 )
 from asca_export.two_stage.graphs import export_refine
-from asca_export.two_stage.parity import prove_refine_parity
+from asca_export.two_stage.parity import check_refine_parity
 from asca_pillars.base.errors import ExportError
 from asca_pillars.base.files import atomic_directory
 from asca_pillars.base.system import default_threads
@@ -83,17 +83,17 @@ def export_refine_bundle(
             refine=section,
         )
 
-        def prove(opened: PillarBundle) -> Parity:
+        def compare(opened: PillarBundle) -> Parity:
             pipeline = RefinePipeline(folder, opened, threads=default_threads())
-            return prove_refine_parity(detector.refiner, stage, pipeline, model, scans)
+            return check_refine_parity(detector.refiner, stage, pipeline, model, scans)
 
-        bundle = write_proven(folder, draft, prove, options.weights)
+        bundle = write_bundle(folder, draft, compare, options.weights)
         if calibration is None:
             return bundle
         options.progress("Putting the first stage in 8 bits")
-        in_steps = dataclasses.replace(in_float, calibration=calibration)
-        eight_bit = _first_bundle(model.first_stage, Path(temporary) / "int8", scans, in_steps)
-        return _in_eight_bits(folder, bundle, first, eight_bit, scans, calibration)
+        quantized = dataclasses.replace(in_float, calibration=calibration)
+        eight_bit = _first_bundle(model.first_stage, Path(temporary) / "int8", scans, quantized)
+        return _to_int8(folder, bundle, first, eight_bit, scans, calibration)
 
 
 def _copy_first_stage(first: Path, proposing: PillarBundle, folder: Path) -> None:
@@ -101,7 +101,7 @@ def _copy_first_stage(first: Path, proposing: PillarBundle, folder: Path) -> Non
     onnx.save(add_neck_output(onnx.load(first / proposing.graphs[BACKBONE].file)), graphs.graph_path(folder, BACKBONE))
 
 
-def _in_eight_bits(
+def _to_int8(
     folder: Path,
     bundle: PillarBundle,
     first: Path,

@@ -19,7 +19,7 @@ from asca_pillars.base.errors import ExportError
 from asca_pillars.base.files import WEIGHTS_FILE
 from asca_pillars.detection.spec import DetectorSpec
 from asca_pillars.models.two_stage.first_stage import open_first_stage
-from asca_pillars.ops.two_stage.first_stage import FirstPass, FirstStage, require_pillar_kind
+from asca_pillars.ops.two_stage.first_stage import FirstStage, FirstStageOutputs, require_pillar_kind
 
 
 def add_neck_output(backbone: onnx.ModelProto) -> onnx.ModelProto:
@@ -91,11 +91,11 @@ def _with_output(backbone: onnx.ModelProto, elem_type: int) -> tuple[onnx.ModelP
 
 def _before_boxes(model: onnx.ModelProto) -> list[onnx.NodeProto]:
     """Return the nodes that the head's boxes depend on, in order; masks of active cells only affect scores."""
-    wanted = {value.name for value in model.graph.output if value.name != "scores"}
+    needed = {value.name for value in model.graph.output if value.name != "scores"}
     found = []
     for node in reversed(model.graph.node):
-        if wanted & set(node.output):
-            wanted |= set(node.input)
+        if needed & set(node.output):
+            needed |= set(node.input)
             found.append(node)
     return found[::-1]
 
@@ -151,7 +151,7 @@ class BundleFirstStage:
         bundle, threads, precision = self._source
         return partial(BundleFirstStage, threads=threads, precision=precision), (bundle,)
 
-    def __call__(self, points: NDArray[np.float32]) -> FirstPass:
+    def __call__(self, points: NDArray[np.float32]) -> FirstStageOutputs:
         """See `FirstStage`."""
         pillars = self._pipeline.pillarize(points)
         return self._backbone.infer_with_neck(self._backbone.place(self._pipeline.encode(pillars), pillars.cells))

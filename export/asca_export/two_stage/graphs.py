@@ -35,7 +35,7 @@ class _Layers(nn.Module):
             pairs = layer(torch.relu(pairs))
         return torch.relu(pairs) @ self.last.weight.T if len(self.layers) > 1 else pairs
 
-    def first_shift(self) -> Tensor | None:
+    def first_bias(self) -> Tensor | None:
         """Return the first layer's bias; None if that layer is the last one too."""
         return self.first.bias if len(self.layers) > 1 else None
 
@@ -45,7 +45,7 @@ class GatheredSetAbstraction(_Layers):
 
     def forward(self, _positions: None, _features: None, _queries: Tensor, balls: Tensor) -> Tensor:
         """Aggregate [p_j - q ; f_j] of each ball, (Q, T, 3 + C), zeros for empty entries, -> (Q, out_channels)."""
-        pairs = F.linear(balls.flatten(0, 1), self.first.weight, self.first_shift())
+        pairs = F.linear(balls.flatten(0, 1), self.first.weight, self.first_bias())
         largest = self.after_first(pairs).unflatten(0, balls.shape[:2]).amax(dim=1)
         return torch.relu(largest + self.last.bias)
 
@@ -57,7 +57,7 @@ class GroupedSetAbstraction(_Layers):
         """Compute `SetAbstraction.forward`: (Q, out_channels)."""
         # Both get a row for nothing: zeros, and the first layer's shift alone.
         points = F.pad(torch.cat([positions, features], dim=1), (0, 0, 0, 1)) @ self.first.weight.T
-        away = F.linear(F.pad(queries, (0, 0, 0, 1)), -self.first.weight[:, :3], self.first_shift())
+        away = F.linear(F.pad(queries, (0, 0, 0, 1)), -self.first.weight[:, :3], self.first_bias())
         largest = []
         for group in balls.groups:
             queries_of_pairs = group.queries[:, None].expand(group.members.shape)  # adding row by row takes longer

@@ -13,11 +13,11 @@ from asca_pillars.config.two_stage import RefineModel
 from asca_pillars.detection.decode import HeadMaps
 from asca_pillars.models.two_stage.layers import PillarRefiner
 from asca_pillars.models.two_stage.preparation import collate_scans
-from asca_pillars.ops.two_stage.first_stage import FirstStage, proposed_from
+from asca_pillars.ops.two_stage.first_stage import FirstStage, second_stage_inputs
 from asca_pillars.ops.two_stage.prepare import refine_scan
 
 
-def prove_refine_parity(
+def check_refine_parity(
     refiner: PillarRefiner,
     stage: FirstStage,
     runtime: RefinePipeline,
@@ -47,7 +47,7 @@ def prove_refine_parity(
             worst = max(worst, require_close(f"head `{name}`", one, other, MAP_TOLERANCE, number))
         allowed = MAP_TOLERANCE * max(1.0, float(np.abs(expected.neck).max(initial=0.0)))
         worst = max(worst, require_close("neck", expected.neck, found.neck, allowed, number))
-        proposed = proposed_from(found, points, model.spec, model.refine.seen)
+        proposed = second_stage_inputs(found, points, model.spec, model.refine.seen)
         if not len(proposed.proposals):
             continue
         compared += 1

@@ -12,7 +12,7 @@ import pytest
 from asca_pillars.base.errors import DatasetError
 from asca_pillars.data.boxes.box_split import BoxSplit
 from asca_pillars.data.importing.argoverse2 import read_argoverse2
-from asca_pillars.data.importing.imported import usable
+from asca_pillars.data.importing.imported import drop_unwritable
 from asca_pillars.data.importing.nuscenes import read_nuscenes
 from tests.data.boxes.box_scenes import write_box_dataset
 from tests.data.importing.foreign_datasets import write_argoverse2, write_nuscenes
@@ -83,7 +83,7 @@ def test_one_bad_box_of_waymo_costs_itself(column: str, value: Any, tmp_path: Pa
 
 
 @pytest.mark.parametrize(
-    ("table", "column", "value", "said"),
+    ("table", "column", "value", "message"),
     [
         ("lidar", f"{IMAGE}.shape", [4, -360, -4], "for the shape"),
         ("lidar", f"{IMAGE}.shape", [3, 480, 4], "for 4 lasers"),
@@ -93,7 +93,9 @@ def test_one_bad_box_of_waymo_costs_itself(column: str, value: Any, tmp_path: Pa
         ("lidar_pose", "[LiDARPoseComponent].range_image_return1.shape", [4, 1080, 2], "poses of shape"),
     ],
 )
-def test_one_bad_image_of_waymo_costs_its_frame(table: str, column: str, value: Any, said: str, tmp_path: Path) -> None:
+def test_one_bad_image_of_waymo_costs_its_frame(
+    table: str, column: str, value: Any, message: str, tmp_path: Path
+) -> None:
     source = write_segment(tmp_path / "waymo", moved_m=1.0)
     change_parquet(
         source / table / "segment.parquet",
@@ -101,7 +103,7 @@ def test_one_bad_image_of_waymo_costs_its_frame(table: str, column: str, value: 
         lambda old: [*old[:-2], value, old[-1]] if table == "lidar" else [old[0], value],
     )
     output = invoke("import", source, tmp_path / "out", "--from", "waymo")
-    assert re.search(f"left out, frames: 1, the first: .*{said}", output), output
+    assert re.search(f"left out, frames: 1, the first: .*{message}", output), output
     assert BoxSplit(tmp_path / "out").frame_ids == ("segment/1000",)
 
 
@@ -146,7 +148,7 @@ def test_a_table_names_no_file_outside_its_dataset(name: str, tmp_path: Path) ->
     rows = json.loads(path.read_text())
     rows.append({**rows[0], "token": "evil", "filename": name.format(secret)})
     path.write_text(json.dumps(rows))
-    imported = usable(read_nuscenes(source))
+    imported = drop_unwritable(read_nuscenes(source))
     assert len(imported.frames) == 1 and imported.left_out.counts["frames"] == 1
     assert "no file below" in imported.left_out.lines()[0]
 
@@ -170,7 +172,7 @@ def test_one_bad_row_of_nuscenes_costs_itself(table: str, key: str, value: Any, 
     rows = json.loads(path.read_text())
     rows[0][key] = value
     path.write_text(json.dumps(rows))
-    imported = usable(read_nuscenes(source))
+    imported = drop_unwritable(read_nuscenes(source))
     assert [frame.records.types for frame in imported.frames] == [("animal",)]
     assert imported.left_out.counts["boxes"] == 1
 
@@ -189,7 +191,7 @@ def test_one_bad_row_of_argoverse_costs_itself(column: str, value: Any, tmp_path
     values = [value, *table.column(index).to_pylist()[1:]]
     array = pyarrow.array(values, table.schema.field(index).type)
     feather.write_feather(table.set_column(index, column, array), path)
-    imported = usable(read_argoverse2(source))
+    imported = drop_unwritable(read_argoverse2(source))
     assert [len(frame.records.types) for frame in imported.frames] == [1, 1]
     assert re.search(r"boxes: 1, the first: .*annotations\.feather, row 0", imported.left_out.lines()[0])
 

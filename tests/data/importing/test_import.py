@@ -10,7 +10,7 @@ import pytest
 
 from asca_pillars.base.errors import AscaError, ConfigError, DatasetError, OutputError, ScanError
 from asca_pillars.data.boxes.box_split import BoxSplit
-from asca_pillars.data.importing.imported import usable
+from asca_pillars.data.importing.imported import drop_unwritable
 from asca_pillars.data.importing.nuscenes import read_nuscenes
 from asca_pillars.geometry.boxes import points_in_boxes
 from asca_pillars.scans.find_scans import find_scans
@@ -193,7 +193,7 @@ def test_nuscenes_mistakes_are_named(tmp_path: Path) -> None:
     whole = poses.read_text()
     poses.write_text(whole.replace("translation", "somewhere"))
     with pytest.raises(DatasetError, match=r"no labelled scan .* frames: 1, .*sample_data\.json, x: no `translation`"):
-        usable(read_nuscenes(source))
+        drop_unwritable(read_nuscenes(source))
     poses.write_text(whole)
     for name, old, new, message in (
         (
@@ -221,7 +221,7 @@ def test_nuscenes_mistakes_are_named(tmp_path: Path) -> None:
         path.write_text(text.replace(old, new, 1))
         imported = read_nuscenes(source)
         with contextlib.suppress(DatasetError):
-            imported = usable(imported)
+            imported = drop_unwritable(imported)
         assert re.search(message, " ".join(imported.left_out.lines())), imported.left_out.lines()
         if message.startswith("boxes"):
             assert [frame.records.types for frame in imported.frames] == [("animal",)], "the other box stays"

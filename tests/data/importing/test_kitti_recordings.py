@@ -9,7 +9,7 @@ import pytest
 from asca_pillars.base.errors import DatasetError
 from asca_pillars.data.boxes.box_split import BoxSplit
 from asca_pillars.data.frames import read_frame
-from asca_pillars.data.importing.imported import usable
+from asca_pillars.data.importing.imported import drop_unwritable
 from asca_pillars.data.importing.kitti_raw import read_kitti_raw
 from asca_pillars.data.importing.kitti_tracking import read_kitti_tracking
 from asca_pillars.geometry.boxes import points_in_boxes
@@ -155,7 +155,7 @@ def test_one_bad_tracklet_costs_itself(tmp_path: Path, old: str, new: str, messa
         assert f"Van {left}" in output and re.search(message, output)
     else:
         with pytest.raises(DatasetError, match=message):
-            usable(imported)
+            drop_unwritable(imported)
 
 
 def test_mistakes_are_named(tmp_path: Path) -> None:
@@ -166,11 +166,11 @@ def test_mistakes_are_named(tmp_path: Path) -> None:
     labels = write_tracking(tmp_path) / "training" / "label_02" / "0000.txt"
     good = labels.read_text()
     labels.write_text(f"Car 0 0 0\n1 2 Car 0 0 0\n{good}")
-    imported = usable(read_kitti_tracking(tmp_path))
+    imported = drop_unwritable(read_kitti_tracking(tmp_path))
     (line,) = imported.left_out.lines()
     assert re.search(r"lines: 2, the first: .*0000\.txt:1: does not begin with a frame's number", line)
     assert sum(len(frame.records.types) for frame in imported.frames) == 2
     for path in labels.parent.iterdir():
         path.write_text("Car 0 0 0")
     with pytest.raises(DatasetError, match=r"no box there that can be used; .*0000\.txt:1: does not begin"):
-        usable(read_kitti_tracking(tmp_path))
+        drop_unwritable(read_kitti_tracking(tmp_path))

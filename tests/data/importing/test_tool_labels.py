@@ -13,7 +13,7 @@ from asca_pillars.base.errors import ConfigError, DatasetError, OutputError
 from asca_pillars.data.boxes.box_records import BoxRecords, json_line, records_from
 from asca_pillars.data.boxes.box_split import BoxSplit
 from asca_pillars.data.importing.formats import FORMATS, TOOLS
-from asca_pillars.data.importing.imported import Imported, usable
+from asca_pillars.data.importing.imported import Imported, drop_unwritable
 from asca_pillars.data.importing.tool_labels import WRITTEN_FILE, ScanLabels, require_unchanged, write_prelabels
 from asca_pillars.scans.scan_reader import write_scan
 from asca_pillars.scans.scan_settings import ScanSettings
@@ -190,7 +190,7 @@ def test_tilted_boxes_are_upright_and_counted(tmp_path: Path) -> None:
     content = json.loads(path.read_text())
     content[0]["psr"]["rotation"]["x"] = 0.2
     path.write_text(json.dumps(content))
-    found = usable(read(source, "sustechpoints"))
+    found = drop_unwritable(read(source, "sustechpoints"))
     assert len(found.frames[0].records.types) == 1
     assert "box 1: rolled or pitched by 0.2 rad, read upright" in found.left_out.lines()[0]
 

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from shapely.geometry import Polygon
 
 from asca_pillars.data.frames import LabeledFrame
-from asca_pillars.data.insertion.free_placement import MARGIN_M, Scene, is_clear, rays_entering, to_free_place
+from asca_pillars.data.insertion.free_placement import MARGIN_M, Scene, is_clear, move_to_free_position, rays_entering
 from asca_pillars.data.insertion.free_space import FreeSpace, find_free_space
 from asca_pillars.data.insertion.gt_database import StoredObject
 from asca_pillars.detection.anchors import IGNORED
@@ -88,7 +88,7 @@ def test_a_free_place(
     space = find_free_space(points)
     item = scanned(stand(name, x, y, yaw))
     scene = Scene(frame_of(points, boxes, [0] * 4), boxes)
-    placed = to_free_place(item, space, scene, GRID, np.random.default_rng(draw))
+    placed = move_to_free_position(item, space, scene, GRID, np.random.default_rng(draw))
     if placed is None:
         return
     # The sensor sees what it saw: the same distance, the same side, the same points in the box.
@@ -123,7 +123,7 @@ def test_places_are_found_where_there_are_some() -> None:
     space = find_free_space(points)
     scene = Scene(frame_of(points, boxes, [0] * 4), boxes)
     found = [
-        to_free_place(scanned(stand("Pedestrian", 12, 0)), space, scene, GRID, np.random.default_rng(seed))
+        move_to_free_position(scanned(stand("Pedestrian", 12, 0)), space, scene, GRID, np.random.default_rng(seed))
         for seed in range(10)
     ]
     assert all(item is not None for item in found) and len({float(item.box[1]) for item in found if item}) >= 8
@@ -134,9 +134,9 @@ def test_no_place_without_ground_or_at_a_distance_without_any() -> None:
     scene = Scene(frame_of(points, boxes, [0] * 4), boxes)
     nowhere = find_free_space(points[:0])
     rng = np.random.default_rng(0)
-    assert to_free_place(scanned(stand("Car", 10, 0)), nowhere, scene, GRID, rng) is None
+    assert move_to_free_position(scanned(stand("Car", 10, 0)), nowhere, scene, GRID, rng) is None
     space: FreeSpace = find_free_space(points)
-    assert to_free_place(scanned(stand("Car", 2.0, 0)), space, scene, GRID, rng) is None
+    assert move_to_free_position(scanned(stand("Car", 2.0, 0)), space, scene, GRID, rng) is None
 
 
 def test_what_is_behind_an_inserted_object_disappears() -> None:
@@ -174,14 +174,14 @@ def test_objects_do_not_hide_one_another() -> None:
     """Neither may most of a labelled object be hidden, nor most of one inserted before, nor of the new one itself."""
     far, near, beside = stand("Pedestrian", 16, 0), stand("Car", 10, 0, np.pi / 2), stand("Car", 10, 6)
     labeled = Scene(frame_of(cast(LEVEL, far[None]), far[None], [1]), far[None])
-    assert not labeled.shows_all_with(scanned(near)) and labeled.shows_all_with(scanned(beside))
+    assert not labeled.keeps_all_visible(scanned(near)) and labeled.keeps_all_visible(scanned(beside))
     ignored = Scene(frame_of(cast(LEVEL, far[None]), far[None], [IGNORED]), far[None])
-    assert ignored.shows_all_with(scanned(near))
+    assert ignored.keeps_all_visible(scanned(near))
     empty = frame_of(cast(LEVEL, NO_BOXES), NO_BOXES, [])
     for first, second in ((far, near), (near, far)):
         scene = Scene(empty, NO_BOXES)
         scene.add(scanned(first))
-        assert not scene.shows_all_with(scanned(second)) and scene.shows_all_with(scanned(beside))
+        assert not scene.keeps_all_visible(scanned(second)) and scene.keeps_all_visible(scanned(beside))
 
 
 def test_inserted_objects_hide_each_other() -> None:

@@ -35,8 +35,8 @@ def with_grid(**changes: Any) -> Config:
 
 
 def inspected(root: Path, config: Config, *, split: str | None = None, frames: int = 500) -> Inspection:
-    wanted = KittiSplit(root, config.data.train_set if split is None else split)
-    return inspect_dataset(wanted, pillar_spec(config), config.data, frames=frames)
+    expected = KittiSplit(root, config.data.train_set if split is None else split)
+    return inspect_dataset(expected, pillar_spec(config), config.data, frames=frames)
 
 
 def found(root: Path, config: Config = CONFIG) -> list[Finding]:

@@ -87,14 +87,14 @@ def test_anchors_stand_where_the_detector_has_them(clean: Path, last_stride: int
     grid = dataclasses.replace(SPEC.grid, **EVEN)
     spec = with_spec(last_stride=last_stride, anchor_places=anchor_places, grid=grid).model.spec
     facts = inspect_dataset(KittiSplit(clean, "training"), spec, tiny_config().data).classes[0]
-    wanted = 0
+    expected = 0
     for frame_id in KittiSplit(clean, "training").frame_ids:
         boxes, types = KittiSplit(clean).labeled_boxes(frame_id)
         cars = boxes[[kind == "Car" for kind in types]]
         anchors = spec.anchors[:, :, :2].reshape(-1, 7)
         overlaps = [_aligned_iou(anchors, box) for box in cars]
-        wanted += sum(iou.max() >= spec.classes[0].positive_iou for iou in overlaps)
-    assert facts.overlapped == wanted
+        expected += sum(iou.max() >= spec.classes[0].positive_iou for iou in overlaps)
+    assert facts.overlapped == expected
 
 
 def _aligned_iou(anchors: np.ndarray, box: np.ndarray) -> np.ndarray:

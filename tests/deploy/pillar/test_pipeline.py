@@ -5,7 +5,7 @@ import pytest
 from numpy.typing import NDArray
 
 from asca_deploy.bundle import CanvasFormat
-from asca_deploy.pillar.pipeline import Canvas, take_free
+from asca_deploy.pillar.pipeline import Canvas, take_or_create
 from asca_pillars.ops.pillar.grid import PillarGrid
 
 # 8 + 16 + 32 columns by 16 rows, off center.
@@ -54,8 +54,8 @@ class TakenMeanwhile(list[Any]):
 
 def test_what_is_free_is_used_again() -> None:
     free = ["kept"]
-    assert (take_free(free, lambda: "made"), take_free(free, lambda: "made")) == ("kept", "made")
+    assert (take_or_create(free, lambda: "made"), take_or_create(free, lambda: "made")) == ("kept", "made")
 
 
 def test_another_thread_may_take_the_last_one() -> None:
-    assert take_free(TakenMeanwhile(), lambda: "made") == "made"
+    assert take_or_create(TakenMeanwhile(), lambda: "made") == "made"

@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from asca_deploy import Detections, Detector
-from asca_deploy.ros2.live import Live
+from asca_deploy.ros2.live import LiveDetection
 from asca_deploy.ros2.messages import ERROR, OK, WARN, Stamp
 from asca_deploy.ros2.node import NodeSettings, reliability
 from asca_deploy.tracker import Tracker
@@ -36,14 +36,14 @@ def cloud(points: NDArray[Any], sec: int = 1, frame_id: str = "lidar", names: tu
 
 
 class Running:
-    """A `Live` at work in its thread, with what it answered."""
+    """A `LiveDetection` at work in its thread, with what it answered."""
 
     def __init__(self, bundle: Path, reading: ScanSettings | None = None, **options: Any) -> None:
         self.answers: list[tuple[Stamp, Detections | Tracks]] = []
         self.events: list[dict[str, Any]] = []
         self.mountings: list[Mounting] = []
         self.came = threading.Semaphore(0)
-        self.live = Live(
+        self.live = LiveDetection(
             self._open(bundle),
             reading or ScanSettings(),
             self._answer,
@@ -68,7 +68,7 @@ class Running:
             self.error = error
 
     def ask(self, one: Any) -> Detections | Tracks:
-        self.live.take(one)
+        self.live.enqueue(one)
         assert self.came.acquire(timeout=20)
         return self.answers[-1][1]
 
@@ -99,13 +99,13 @@ def test_no_points_not_numbers_and_other_fields(tiny_bundle: Path, scan: NDArray
     broken = scan.copy()
     broken[::2, 1] = np.nan
     running.ask(cloud(broken))
-    running.live.take(cloud(scan, names=("u", "v", "w", "intensity")))
-    running.live.take(cloud(scan, names=("u", "v", "w", "intensity")))
+    running.live.enqueue(cloud(scan, names=("u", "v", "w", "intensity")))
+    running.live.enqueue(cloud(scan, names=("u", "v", "w", "intensity")))
     running.ask(cloud(scan[:, :3], names=("x", "y", "z")))
     running.end()
     health = running.live.health
     assert (health.received, health.answered, health.unreadable) == (5, 3, 2)
-    assert health.trouble is not None and "no field x" in health.trouble
+    assert health.error_text is not None and "no field x" in health.error_text
     assert [one["event"] for one in running.events].count("unreadable") == 1
 
 
@@ -119,10 +119,10 @@ def test_the_oldest_scan_gives_way(tiny_bundle: Path, scan: NDArray[np.float32])
         running.answers.append((stamp, found))
 
     running.live._answer = held
-    running.live.take(cloud(scan, 0))
+    running.live.enqueue(cloud(scan, 0))
     assert entered.wait(20)
     for sec in range(1, 11):
-        running.live.take(cloud(scan, sec))
+        running.live.enqueue(cloud(scan, sec))
     assert running.live.busy_s() > 0
     dropped = running.live.health.dropped
     assert dropped >= 6
@@ -166,19 +166,19 @@ def test_the_mounting_is_taken_from_the_transforms_when_there_are_some(
         return known.get(frame)
 
     running = Running(tiny_bundle, ScanSettings(sensor_height=0.25), pose_of=pose_of)
-    running.live.take(cloud(scan, 1, "roof"))
+    running.live.enqueue(cloud(scan, 1, "roof"))
     assert asked.wait(20)
     known["roof"] = pose
     while not any(one["event"] == "transform" for one in running.events):
         assert running.thread.is_alive()
     running.ask(cloud(scan, 2, "roof"))
-    running.live.take(cloud(scan, 3, "bumper"))
+    running.live.enqueue(cloud(scan, 3, "bumper"))
     running.end()
     assert np.array(running.mountings[-1].pose) == pytest.approx(pose)
     assert running.mountings[-1].sensor_height_m == 0.25
     events = [one["event"] for one in running.events if one["event"] != "reflectance_scale"]
     assert events == ["waiting", "transform", "unreadable"]
-    assert running.live.health.trouble is not None and "bumper" in running.live.health.trouble
+    assert running.live.health.error_text is not None and "bumper" in running.live.health.error_text
 
 
 def test_a_height_is_estimated_from_the_first_scans(tiny_bundle: Path) -> None:
@@ -186,7 +186,7 @@ def test_a_height_is_estimated_from_the_first_scans(tiny_bundle: Path) -> None:
     ground = np.column_stack([rng.uniform(-20, 20, (20_000, 2)), np.full(20_000, -1.4), np.full(20_000, 0.3)])
     running = Running(tiny_bundle, ScanSettings(sensor_height="auto"))
     while not running.came.acquire(timeout=0.02):
-        running.live.take(cloud(ground))
+        running.live.enqueue(cloud(ground))
         assert running.thread.is_alive()
     running.end()
     assert running.mountings[-1].sensor_height_m == pytest.approx(1.4, abs=0.05)
@@ -196,7 +196,7 @@ def test_a_node_can_end_before_it_knows_the_mounting(tiny_bundle: Path, scan: ND
     for clouds in ([], [cloud(scan)]):
         running = Running(tiny_bundle, pose_of=lambda frame: None)
         for one in clouds:
-            running.live.take(one)
+            running.live.enqueue(one)
         running.end()
         assert running.error is None and not running.answers
 
@@ -208,16 +208,18 @@ def test_what_ends_the_detector_is_told(tiny_bundle: Path, scan: NDArray[np.floa
         raise ScanError("full")
 
     running.live._answer = fail
-    running.live.take(cloud(scan))
+    running.live.enqueue(cloud(scan))
     running.thread.join(timeout=20)
     assert isinstance(running.error, ScanError)
     assert running.live.health.status("/points", 1) == (ERROR, "full")
 
 
 def test_diagnostics_say_what_is_wrong(tiny_bundle: Path, scan: NDArray[np.float32]) -> None:
-    live = Live(lambda _: Detector(tiny_bundle, threads=1), ScanSettings(), lambda *_: None, lambda *_, **__: None)
+    live = LiveDetection(
+        lambda _: Detector(tiny_bundle, threads=1), ScanSettings(), lambda *_: None, lambda *_, **__: None
+    )
     health = live.health
-    health.take()
+    health.count_received()
     assert health.status("/points", 1) == (OK, "every scan is answered")
     assert health.status("/points", 0) == (WARN, "nobody publishes /points")
     health.dropped += 2

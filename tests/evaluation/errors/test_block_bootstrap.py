@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from asca_pillars.evaluation.errors.error_summary import BLOCK_FRAMES, DRAWS, MIN_BLOCKS, resamples
+from asca_pillars.evaluation.errors.error_summary import BLOCK_FRAMES, DRAWS, MIN_BLOCKS, bootstrap_samples
 
 FRAMES = 60
 
 
 def test_blocks_are_drawn_whole() -> None:
-    drawn = resamples([np.arange(FRAMES)], FRAMES)
+    drawn = bootstrap_samples([np.arange(FRAMES)], FRAMES)
     assert drawn.weights.shape == (DRAWS, FRAMES)
     blocks = drawn.weights.reshape(DRAWS, FRAMES // BLOCK_FRAMES, BLOCK_FRAMES)
     assert (blocks == blocks[..., :1]).all()
@@ -19,7 +19,7 @@ def test_blocks_are_drawn_whole() -> None:
 
 def test_parts_are_drawn_before_blocks() -> None:
     parts = [np.arange(0, 30), np.arange(30, 50)]
-    drawn = resamples(parts, FRAMES)
+    drawn = bootstrap_samples(parts, FRAMES)
     assert not drawn.weights[:, 50:].any(), "frames of no part"
     first, second = (drawn.weights[:, part].sum(axis=1) for part in parts)
     assert set(zip(first.tolist(), second.tolist(), strict=True)) == {(60, 0), (30, 20), (0, 40)}
@@ -28,7 +28,7 @@ def test_parts_are_drawn_before_blocks() -> None:
 def test_median_and_ratio_are_those_of_the_resamples() -> None:
     rng = np.random.default_rng(1)
     frames, values = rng.integers(FRAMES, size=200), rng.normal(size=200)
-    drawn = resamples([np.arange(FRAMES)], FRAMES)
+    drawn = bootstrap_samples([np.arange(FRAMES)], FRAMES)
     heaps = [np.repeat(values, row[frames].astype(int)) for row in drawn.weights]
     medians = [np.sort(heap)[(len(heap) - 1) // 2] for heap in heaps]
     assert drawn.median_interval(values, frames) == pytest.approx(np.quantile(medians, [0.025, 0.975]))
@@ -39,14 +39,14 @@ def test_median_and_ratio_are_those_of_the_resamples() -> None:
 
 def test_frames_that_are_alike_make_wider_intervals() -> None:
     rng = np.random.default_rng(2)
-    drawn, frames = resamples([np.arange(400)], 400), np.arange(400)
+    drawn, frames = bootstrap_samples([np.arange(400)], 400), np.arange(400)
     alone, alike = rng.normal(size=400), np.repeat(rng.normal(size=40), 10)
     narrow, wide = (drawn.median_interval(values, frames) for values in (alone, alike))
     assert narrow is not None and wide is not None and wide[1] - wide[0] > 2 * (narrow[1] - narrow[0])
 
 
 def test_values_of_few_blocks_have_no_interval() -> None:
-    drawn = resamples([np.arange(FRAMES)], FRAMES)
+    drawn = bootstrap_samples([np.arange(FRAMES)], FRAMES)
     few = np.arange((MIN_BLOCKS - 1) * BLOCK_FRAMES)
     assert drawn.median_interval(few.astype(float), few) is None
     assert drawn.median_interval(np.zeros(0), np.zeros(0, int)) is None

@@ -74,11 +74,11 @@ def test_boxes_without_size_overlap_nothing(sizes: dict[str, float]) -> None:
 
 def test_blocks_of_pairs_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     frames = Frames.join(*random_frames(0, 8, 20))
-    wanted = np.arange(len(frames.truth)) % 3 > 0
-    whole = overlapping_pairs(frames, wanted, 0.5)
+    expected = np.arange(len(frames.truth)) % 3 > 0
+    whole = overlapping_pairs(frames, expected, 0.5)
     monkeypatch.setattr("asca_pillars.evaluation.kitti.pairs._BLOCK_PAIRS", 13)
-    parts = overlapping_pairs(frames, wanted, 0.5)
-    assert len(whole.truth) and not set(whole.truth) - set(np.flatnonzero(wanted))
+    parts = overlapping_pairs(frames, expected, 0.5)
+    assert len(whole.truth) and not set(whole.truth) - set(np.flatnonzero(expected))
     for name in ("truth", "detection", "frame"):
         np.testing.assert_array_equal(getattr(parts, name), getattr(whole, name))
     for metric in EVERY:

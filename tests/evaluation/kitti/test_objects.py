@@ -5,7 +5,7 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
-from asca_pillars.evaluation.kitti.objects import FrameObjects, frame_objects, stacked
+from asca_pillars.evaluation.kitti.objects import FrameObjects, concatenate_frames, frame_objects
 from tests.evaluation.kitti.kitti_objects import CAR, DONT_CARE
 
 
@@ -26,7 +26,7 @@ def test_nothing_has_the_shapes_of_nothing() -> None:
     frame = frame_objects("000000", [])
     assert len(frame) == 0
     assert frame.bbox.shape == (0, 4) and frame.dimensions_hwl.shape == (0, 3) and frame.scores.shape == (0,)
-    assert len(stacked([])) == 0 and len(stacked([frame, frame])) == 0
+    assert len(concatenate_frames([])) == 0 and len(concatenate_frames([frame, frame])) == 0
 
 
 def test_distance_is_horizontal_and_from_the_camera() -> None:
@@ -42,7 +42,7 @@ def test_types_fold_their_case() -> None:
 def test_stacking_keeps_the_order() -> None:
     first = frame_objects("000000", [CAR, DONT_CARE])
     second = frame_objects("000001", [replace(CAR, type="Van", x_m=9.0)])
-    both = stacked([first, second])
+    both = concatenate_frames([first, second])
     assert both.types == ("Car", "DontCare", "Van")
     for field in fields(FrameObjects)[2:]:
         parts = [getattr(first, field.name), getattr(second, field.name)]

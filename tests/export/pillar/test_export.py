@@ -54,11 +54,11 @@ def test_a_bundle_finds_what_its_checkpoint_finds(exported: Exports, cpa: CpaRea
     """Not by the exporter's own report; one scan, for PyTorch takes seconds of attention among points."""
     checkpoint, (points, *_) = tiny_checkpoint(cpa), SCANS
     found = Detector(exported(cpa), score_threshold=0.0, threads=1)(points)
-    wanted = ScanDetector(checkpoint.detector, SPEC.with_score_threshold(0.0))(points)
-    assert len(found) == len(wanted) > 0
-    np.testing.assert_allclose(found.boxes, wanted.boxes, atol=1e-2)
-    np.testing.assert_allclose(found.scores, wanted.scores, atol=1e-3)
-    np.testing.assert_array_equal(found.labels, wanted.labels)
+    expected = ScanDetector(checkpoint.detector, SPEC.with_score_threshold(0.0))(points)
+    assert len(found) == len(expected) > 0
+    np.testing.assert_allclose(found.boxes, expected.boxes, atol=1e-2)
+    np.testing.assert_allclose(found.scores, expected.scores, atol=1e-3)
+    np.testing.assert_array_equal(found.labels, expected.labels)
 
 
 def test_features_are_compared_at_their_own_scale(tmp_path: Path) -> None:

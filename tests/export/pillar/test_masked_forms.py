@@ -10,10 +10,10 @@ from torch.nn import functional as F  # noqa: N812  (torch's own convention)
 
 from asca_deploy import Detector
 from asca_deploy.manifest import load_pillar_bundle
+from asca_export.bundle_writer import ExportOptions
 from asca_export.export import export_bundle
 from asca_export.pillar.export import export_pillar_bundle
 from asca_export.pillar.masked_forms import NEVER, MarkedEncoder, MaskedBackbone
-from asca_export.proven_bundle import ExportOptions
 from asca_export.two_stage.first_stage import BundleFirstStage
 from asca_pillars.base.errors import ExportError
 from asca_pillars.detection.decode import HeadMaps
@@ -57,8 +57,8 @@ def _canvas(detector: PillarDetector, features: Tensor, cells: Tensor) -> Tensor
     return F.pad(image, (0, 0, 1, 0, 1, 0))
 
 
-def _rows(maps: tuple[Tensor, ...], tables: NeckRulebooks[Tensor]) -> HeadMaps[Tensor]:
-    return HeadMaps(*(part.flatten(0, 2)[tables.head_cells.long()] for part in maps))
+def _rows(maps: tuple[Tensor, ...], rulebooks: NeckRulebooks[Tensor]) -> HeadMaps[Tensor]:
+    return HeadMaps(*(part.flatten(0, 2)[rulebooks.head_cells.long()] for part in maps))
 
 
 @pytest.mark.parametrize("rule", RULES)
@@ -67,21 +67,21 @@ def test_masks_give_what_tables_give(rule: str) -> None:
     detector = tiny_detector("channel", neck="sparse", active_cells=rule)
     pillars = SPEC.pillarize(LEFT[0])
     batch = batch_pillars([pillars], [detector.preparation.place(pillars)])
-    tables = batch.neck
-    assert tables is not None and isinstance(detector.neck, SparseRPNNeck)
+    rulebooks = batch.neck
+    assert rulebooks is not None and isinstance(detector.neck, SparseRPNNeck)
     with torch.inference_mode():
         features = detector.encode(batch.features, batch.pillar_index, batch.point_counts).clone()
         features[:: len(features) // 5] = 0
-        expected = detector.head.at_cells(detector.neck(features, tables))
+        expected = detector.head.at_cells(detector.neck(features, rulebooks))
         backbone, marked = MaskedBackbone(detector), MarkedEncoder(_Given(features))(*batch[:3])
         found = backbone(_canvas(detector, marked, batch.cells))
         unmarked = backbone(_canvas(detector, features, batch.cells))
-    for ours, theirs in zip(_rows(found, tables), expected, strict=True):
+    for ours, theirs in zip(_rows(found, rulebooks), expected, strict=True):
         torch.testing.assert_close(ours, theirs, atol=1e-4, rtol=1e-4)
     elsewhere = torch.ones(found[0].shape[1:3]).bool().flatten()
-    elsewhere[tables.head_cells.long()] = False
+    elsewhere[rulebooks.head_cells.long()] = False
     assert elsewhere.any() and (found[0].flatten(0, 2)[elsewhere] == NEVER).all()
-    assert (_rows(unmarked, tables).scores - expected.scores).abs().max() > 0.01, "the marks decide"
+    assert (_rows(unmarked, rulebooks).scores - expected.scores).abs().max() > 0.01, "the marks decide"
 
 
 def test_the_bundles_find_the_same(bundles: tuple[Path, Path]) -> None:

@@ -21,7 +21,7 @@ from asca_deploy.pv_rcnn.graphs import balls_around, deform_inputs, keeps_memory
 from asca_deploy.pv_rcnn.pipeline import PvRcnnPipeline
 from asca_export.pv_rcnn.export import export_pv_rcnn_bundle
 from asca_export.pv_rcnn.graphs import export_deform, export_refine_head
-from asca_export.pv_rcnn.parity import prove_pv_rcnn_parity
+from asca_export.pv_rcnn.parity import check_pv_rcnn_parity
 from asca_pillars.base.errors import BundleError, ExportError
 from asca_pillars.config.pv_rcnn import PvRcnnModel
 from asca_pillars.config.tree import load_config
@@ -64,11 +64,11 @@ def test_train_export_detect(trained: Trained, tmp_path: Path) -> None:
 @pytest.mark.parametrize("threads", [2, 4])
 def test_more_threads_change_no_bit(trained: Trained, threads: int) -> None:
     one, several = (Detector(trained[1], score_threshold=0.0, threads=count) for count in (1, threads))
-    wanted = one(SCANS[0])
+    expected = one(SCANS[0])
     for _ in range(3):
         found = several(SCANS[0])
-        np.testing.assert_array_equal(found.boxes, wanted.boxes)
-        np.testing.assert_array_equal(found.scores, wanted.scores)
+        np.testing.assert_array_equal(found.boxes, expected.boxes)
+        np.testing.assert_array_equal(found.scores, expected.scores)
 
 
 def test_scans_with_little_or_nothing(trained: Trained) -> None:
@@ -93,9 +93,9 @@ def test_a_canvas_forgets_the_scan_before() -> None:
     for cells in ([0, 5, 23], [1, 5], []):
         features = np.random.default_rng(0).random((len(cells), 3)).astype(np.float32)
         canvas.scatter(features, np.array(cells, np.int64))
-        wanted = np.zeros((24, 3), np.float32)
-        wanted[cells] = features
-        np.testing.assert_array_equal(canvas.image.reshape(24, 3), wanted)
+        expected = np.zeros((24, 3), np.float32)
+        expected[cells] = features
+        np.testing.assert_array_equal(canvas.image.reshape(24, 3), expected)
     assert np.shares_memory(canvas.rows, canvas.image) and canvas.rows.shape == (12, 6)
 
 
@@ -165,12 +165,12 @@ def test_other_weights_are_no_parity(trained: Trained, part: str, stage: str) ->
         with torch.no_grad():
             weight.add_(0.5)
         with pytest.raises(ExportError, match=f"part at stage ({stage})"):
-            prove_pv_rcnn_parity(detector.network, PvRcnnPipeline(folder, bundle), SCANS[:1])
+            check_pv_rcnn_parity(detector.network, PvRcnnPipeline(folder, bundle), SCANS[:1])
     finally:
         with torch.no_grad():
             weight.copy_(kept)
     with pytest.raises(ExportError, match="none of the scans"):
-        prove_pv_rcnn_parity(detector.network, PvRcnnPipeline(folder, bundle), [np.empty((0, 4), np.float32)])
+        check_pv_rcnn_parity(detector.network, PvRcnnPipeline(folder, bundle), [np.empty((0, 4), np.float32)])
 
 
 def test_pooling_of_balls(trained: Trained, tmp_path: Path) -> None:
@@ -186,11 +186,11 @@ def test_pooling_of_balls(trained: Trained, tmp_path: Path) -> None:
     with torch.inference_mode():
         indices = [torch.from_numpy(index) for index in grid.indices]
         given = (torch.from_numpy(part) for part in (keypoints, features, grid.points))
-        wanted = network.refine(*given, indices)
+        expected = network.refine(*given, indices)
     session = onnxruntime.InferenceSession(tmp_path / "refine.onnx", providers=["CPUExecutionProvider"])
     arrays: dict[str, np.ndarray] = {f"grid_{number}": index for number, index in enumerate(grid.indices)}
     arrays |= {"keypoints": keypoints, "features": features, "grid_points": grid.points}
-    for one, other in zip(session.run(["confidence", "residuals"], arrays), wanted, strict=True):
+    for one, other in zip(session.run(["confidence", "residuals"], arrays), expected, strict=True):
         np.testing.assert_allclose(one, other.numpy(), atol=1e-4)
 
 
@@ -208,12 +208,12 @@ def test_a_place_for_each_radius(trained: Trained, tmp_path: Path) -> None:
     batch = batch_scans([scan], SPEC)
     with torch.inference_mode():
         levels = network.propose(batch).levels
-        wanted = network.deformed_places(batch, levels)["conv2"]
+        expected = network.deformed_positions(batch, levels)["conv2"]
     session = onnxruntime.InferenceSession(tmp_path / "deform.onnx", providers=["CPUExecutionProvider"])
     given = deform_inputs(scan, settings, {"conv2": levels[1].numpy()})
     found = session.run(None, {each.name: given[each.name] for each in session.get_inputs()})
     assert [each.name for each in session.get_outputs()] == ["conv2_place_0", "conv2_place_1"]
-    for one, other in zip(found, wanted, strict=True):
+    for one, other in zip(found, expected, strict=True):
         np.testing.assert_allclose(one, other.numpy(), atol=1e-5)
         assert np.abs(one - scan.keypoints).max() > 1e-3
     balls = balls_around(scan, settings, dict(zip(("conv2_place_0", "conv2_place_1"), found, strict=True)))

@@ -18,8 +18,8 @@ from asca_deploy.manifest import load_bundle, write_bundle_manifest
 from asca_deploy.pv_rcnn.graphs import OUT, voxel_inputs
 from asca_deploy.pv_rcnn.pipeline import PvRcnnPipeline
 from asca_export import graphs, int8
+from asca_export.bundle_writer import ExportOptions
 from asca_export.int8 import logit_error
-from asca_export.proven_bundle import ExportOptions
 from asca_export.pv_rcnn.export import export_pv_rcnn_bundle
 from asca_export.pv_rcnn.int8 import quantize_pv_rcnn_bundle
 from asca_export.pv_rcnn.voxel_forms import VoxelProducts, VoxelSample, scale_voxels_to_steps
@@ -111,12 +111,12 @@ def test_what_the_second_stage_reads_is_what_it_was(folders: tuple[Path, Path]) 
     (_, floating), (_, eight_bit) = (opened(folder) for folder in folders)
     errors = []
     for points in SCANS[:3]:
-        wanted, found = (pipeline.prepare(points, []) for pipeline in (floating, eight_bit))
-        assert wanted.canvas is not None and found.canvas is not None and found.canvas.image.dtype == np.uint8
-        for name, level in wanted.levels.items():
+        expected, found = (pipeline.prepare(points, []) for pipeline in (floating, eight_bit))
+        assert expected.canvas is not None and found.canvas is not None and found.canvas.image.dtype == np.uint8
+        for name, level in expected.levels.items():
             error = np.sqrt(np.square(found.levels[name] - level).mean()) / level.std()
             assert found.levels[name].dtype == np.float32 and error < 0.1, name
-        first = [pipeline.infer(each, []) for pipeline, each in ((floating, wanted), (eight_bit, found))]
+        first = [pipeline.infer(each, []) for pipeline, each in ((floating, expected), (eight_bit, found))]
         features = [
             pipeline.encode_keypoints(each.scan, each.levels, each.bev, {}, each.scan.ball_indices)
             for pipeline, each in zip((floating, eight_bit), first, strict=True)
@@ -144,10 +144,10 @@ def test_onnxruntime_computes_what_the_graph_says(folders: tuple[Path, Path], na
             given = {"canvas": prepared.canvas.image}
             found = pipeline.neck_and_head(prepared.canvas.image)._asdict()
         for output, values in found.items():
-            (wanted,) = plain.run([output], given)
-            wanted = wanted if name == "voxels" else np.moveaxis(wanted[0], -1, 0)
-            error = wanted.astype(np.float64) - values
-            errors[output].append(np.sqrt(np.square(error).mean()) / wanted.std())
+            (expected,) = plain.run([output], given)
+            expected = expected if name == "voxels" else np.moveaxis(expected[0], -1, 0)
+            error = expected.astype(np.float64) - values
+            errors[output].append(np.sqrt(np.square(error).mean()) / expected.std())
     # One value in the middle between two steps may round either way. Of 29 other weights and three scans each four
     # scans had one, of these eight scans two; each layer then spreads it, to a quarter of the rows of the last and to
     # 2 % here. The scans without are the same.
@@ -158,12 +158,12 @@ def test_onnxruntime_computes_what_the_graph_says(folders: tuple[Path, Path], na
 @pytest.mark.parametrize("threads", [2, 4])
 def test_more_threads_change_no_bit(folders: tuple[Path, Path], threads: int) -> None:
     one, several = (Detector(folders[1], threads=count) for count in (1, threads))
-    wanted = one(SCANS[0])
-    assert len(wanted)
+    expected = one(SCANS[0])
+    assert len(expected)
     for _ in range(3):
         found = several(SCANS[0])
-        np.testing.assert_array_equal(found.boxes, wanted.boxes)
-        np.testing.assert_array_equal(found.scores, wanted.scores)
+        np.testing.assert_array_equal(found.boxes, expected.boxes)
+        np.testing.assert_array_equal(found.scores, expected.scores)
 
 
 def test_scans_with_little_or_nothing_and_a_stream(folders: tuple[Path, Path]) -> None:
@@ -171,8 +171,8 @@ def test_scans_with_little_or_nothing_and_a_stream(folders: tuple[Path, Path]) -
     alone = [detector(points) for points in SCANS]
     for points in (np.empty((0, 4)), np.array([[200, 0, 0, 0.5]]), np.array([[10, 0, -1, 0.5]])):
         assert np.isfinite(detector(points.astype(np.float32)).boxes).all()
-    for found, wanted in zip(detector.stream(SCANS), alone, strict=True):
-        np.testing.assert_array_equal(found.boxes, wanted.boxes)
+    for found, expected in zip(detector.stream(SCANS), alone, strict=True):
+        np.testing.assert_array_equal(found.boxes, expected.boxes)
 
 
 def test_steps_change_nothing_before_they_are_rounded() -> None:
@@ -181,15 +181,15 @@ def test_steps_change_nothing_before_they_are_rounded() -> None:
     samples = []
     for seed in (1, 2):
         scans = batch(detector, frame(seed)).scans
-        tables = {f"same_{number}": level.same for number, level in enumerate(scans.levels[:-1])}
-        tables |= {f"strided_{number}": level.strided for number, level in enumerate(scans.levels) if number}
-        samples.append(VoxelSample(scans.features, tables))
+        rulebooks = {f"same_{number}": level.same for number, level in enumerate(scans.levels[:-1])}
+        rulebooks |= {f"strided_{number}": level.strided for number, level in enumerate(scans.levels) if number}
+        samples.append(VoxelSample(scans.features, rulebooks))
         with torch.inference_mode():
-            wanted = detector.network.voxels(scans.features, scans.levels)
+            expected = detector.network.voxels(scans.features, scans.levels)
     products = VoxelProducts(detector.network.voxels)
     steps = scale_voxels_to_steps(products, samples)
     found = {name: output for name, _, output in products.passes(*samples[-1])}
-    for level, values in zip(("conv1", "conv2", "conv3", "conv4", OUT), wanted, strict=True):
+    for level, values in zip(("conv1", "conv2", "conv3", "conv4", OUT), expected, strict=True):
         name = products.last_of(level)
         torch.testing.assert_close(found[name] * 64 * steps[name], values, rtol=1e-3, atol=1e-4)
         assert found[name].max() <= 255 / 64 * 1.0001

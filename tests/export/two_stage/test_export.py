@@ -16,9 +16,9 @@ from asca_deploy.bundle import GRAPHS, MANIFEST
 from asca_deploy.golden import golden_stages
 from asca_deploy.manifest import load_pillar_bundle
 from asca_deploy.two_stage.pipeline import RefinePipeline
+from asca_export.bundle_writer import ExportOptions
 from asca_export.int8 import MAX_LOGIT_ERROR
 from asca_export.pillar.export import export_pillar_bundle
-from asca_export.proven_bundle import ExportOptions
 from asca_export.two_stage import export as refine_exporter
 from asca_export.two_stage.export import export_refine_bundle
 from asca_export.two_stage.graphs import fold_norms
@@ -155,8 +155,8 @@ def test_folded_norms_change_nothing() -> None:
     with torch.no_grad():
         for _ in range(3):
             refiner(inputs)  # statistics that are not those of fresh weights
-        wanted, found = refiner.eval()(inputs), fold_norms(refiner)(inputs)
-    for one, other in zip(wanted, found, strict=True):
+        expected, found = refiner.eval()(inputs), fold_norms(refiner)(inputs)
+    for one, other in zip(expected, found, strict=True):
         torch.testing.assert_close(other, one, atol=1e-4, rtol=1e-4)
     assert any(isinstance(module, torch.nn.BatchNorm1d) for module in refiner.modules())
     assert not any(isinstance(module, torch.nn.BatchNorm1d) for module in fold_norms(refiner).modules())

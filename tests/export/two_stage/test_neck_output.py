@@ -43,12 +43,12 @@ def test_steps_are_the_map_before_it_is_scaled(zero: int) -> None:
     graph = onnx.helper.make_graph(nodes, "backbone", [value], [other], stored)
     backbone = onnx.helper.make_model(graph, opset_imports=[onnx.helper.make_opsetid("", 20)], ir_version=10)
     x = np.random.default_rng(0).integers(0, 256, (5, 4)).astype(np.uint8)
-    wanted = run(add_neck_output(backbone), x=x)
-    assert (wanted == (np.tile(x, 2).astype(np.float32) - zero) / 4).all()
+    expected = run(add_neck_output(backbone), x=x)
+    assert (expected == (np.tile(x, 2).astype(np.float32) - zero) / 4).all()
     model, step = add_neck_steps(backbone)
     found = run(model, x=x)
     assert found.dtype == (np.float32 if zero else np.uint8), "steps of which 0 is not zero have no use"
-    assert (found * np.float32(step) == wanted).all()
+    assert (found * np.float32(step) == expected).all()
 
 
 def test_the_second_stage_scales_what_it_reads() -> None:

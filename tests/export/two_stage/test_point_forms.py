@@ -50,13 +50,13 @@ def test_forms(widths: tuple[int, ...]) -> None:
     )
     with torch.no_grad():
         around = torch.from_numpy(queries)
-        wanted = module(positions, features, around, torch.from_numpy(indices))
+        expected = module(positions, features, around, torch.from_numpy(indices))
         by_groups = GroupedSetAbstraction(module)(positions, features, around, groups)
         gathered = torch.from_numpy(gather_balls(points, queries, indices))
         by_points = GatheredSetAbstraction(module)(None, None, around, gathered)
-    assert wanted.std() > 0.1
-    torch.testing.assert_close(by_groups, wanted, atol=2e-5, rtol=1e-5)
-    torch.testing.assert_close(by_points, wanted, atol=2e-5, rtol=1e-5)
+    assert expected.std() > 0.1
+    torch.testing.assert_close(by_groups, expected, atol=2e-5, rtol=1e-5)
+    torch.testing.assert_close(by_points, expected, atol=2e-5, rtol=1e-5)
 
 
 class _Grouped(torch.nn.Module):
@@ -104,5 +104,5 @@ def test_groups_without_balls_in_onnxruntime(radius_m: float, tmp_path: Path) ->
     session = onnxruntime.InferenceSession(tmp_path / "grouped.onnx", providers=["CPUExecutionProvider"])
     (found,) = session.run(None, given)
     with torch.no_grad():
-        wanted = module(*map(torch.from_numpy, (points[:, :3], points[:, 3:], queries, indices)))
-    np.testing.assert_allclose(found, wanted.numpy(), atol=2e-5, rtol=1e-5)
+        expected = module(*map(torch.from_numpy, (points[:, :3], points[:, 3:], queries, indices)))
+    np.testing.assert_allclose(found, expected.numpy(), atol=2e-5, rtol=1e-5)

@@ -91,7 +91,7 @@ def test_boxes_are_decoded_as_theirs() -> None:
     best = np.sort(scores.max(axis=-1).reshape(-1))[-20]
     spec = dataclasses.replace(SPEC, post=PostProcess(nms_iou=1.0, max_detections=1000))
     found = spec.with_score_threshold(float(1 / (1 + np.exp(-best.astype(np.float64) + 1e-6)))).decode(maps)
-    wanted = []
+    expected = []
     for y, x, size, turned in np.argwhere(scores.max(axis=-1) >= best):
         anchor, residual = SPEC.classes[size], residuals[y, x, size, turned]
         # Anchors from end to end of the range, on their feet; the direction bin has the half circle from 45 degrees on.
@@ -102,11 +102,11 @@ def test_boxes_are_decoded_as_theirs() -> None:
         yaw = yaw - np.floor(yaw / np.pi) * np.pi + np.pi / 4 + np.pi * directions[y, x, size, turned].argmax()
         place = center + residual[:3] * [diagonal, diagonal, dims[2]]
         label = scores[y, x, size, turned].argmax()
-        wanted.append([label, *place, *(dims * np.exp(residual[3:6])), np.sin(yaw), np.cos(yaw)])
+        expected.append([label, *place, *(dims * np.exp(residual[3:6])), np.sin(yaw), np.cos(yaw)])
     yaws = found.boxes[:, 6:]
     ours = np.hstack([found.labels[:, None], found.boxes[:, :6], np.sin(yaws), np.cos(yaws)])
-    assert len(ours) == len(wanted) == 20 and len(set(found.labels)) > 1
-    wanted_rows = np.array(wanted)
+    assert len(ours) == len(expected) == 20 and len(set(found.labels)) > 1
+    wanted_rows = np.array(expected)
     np.testing.assert_allclose(
         ours[np.lexsort(ours.T[1:3])], wanted_rows[np.lexsort(wanted_rows.T[1:3])], atol=2e-3, rtol=1e-4
     )

@@ -86,8 +86,8 @@ def test_where_everything_is_active_it_is_the_dense_neck() -> None:
     sparse.load_state_dict(dense.state_dict())  # the same names and shapes
     ny, nx = SPEC.grid.ny, SPEC.grid.nx
     features = torch.randn(ny * nx, 8, dtype=torch.float64)
-    tables = NeckRulebookBuilder(ny, nx, "fine").build(np.arange(ny * nx))
-    (batch,) = [batch_pillars([SPEC.pillarize(make_scene(0)[0])], [Placement(None, tables)])]
+    rulebooks = NeckRulebookBuilder(ny, nx, "fine").build(np.arange(ny * nx))
+    (batch,) = [batch_pillars([SPEC.pillarize(make_scene(0)[0])], [Placement(None, rulebooks)])]
     assert isinstance(sparse.neck, SparseRPNNeck) and isinstance(dense.neck, RPNNeck) and batch.neck is not None
     with torch.no_grad():
         expected = dense.neck(features.view(1, ny, nx, 8).permute(0, 3, 1, 2))

@@ -41,11 +41,12 @@ def test_features_are_adjusted_as_eq_10_says() -> None:
         found = module(features, counted).numpy()
     for group, own, members in zip(features.numpy(), found, counted.numpy().astype(bool), strict=True):
         for i in np.flatnonzero(members):
-            wanted = (impact(module, group[i]) + 1) * group[i]  # beta_i F_i
+            expected = (impact(module, group[i]) + 1) * group[i]  # beta_i F_i
             for j in np.flatnonzero(members):
                 if j != i:
-                    wanted = wanted - impact(module, group[i] - group[j]) * (group[j] - group[i])  # beta_j (F_j - F_i)
-            np.testing.assert_allclose(own[i], wanted, atol=1e-12)
+                    # beta_j (F_j - F_i)
+                    expected = expected - impact(module, group[i] - group[j]) * (group[j] - group[i])
+            np.testing.assert_allclose(own[i], expected, atol=1e-12)
 
 
 def test_gradients() -> None:
@@ -91,9 +92,9 @@ def test_coarse_features_reach_every_keypoint() -> None:
             of_scales.append(rows)
         coarse = scales[1]
         brought = (of_scales[1][coarse.nearest] * coarse.nearest_weights[:, :, None]).sum(axis=1)
-        wanted = module.join(torch.from_numpy(np.concatenate([of_scales[0], brought], axis=1))).numpy()
+        expected = module.join(torch.from_numpy(np.concatenate([of_scales[0], brought], axis=1))).numpy()
     assert found.shape == (40, 5)
-    np.testing.assert_allclose(found, wanted, atol=1e-6)
+    np.testing.assert_allclose(found, expected, atol=1e-6)
 
 
 def test_scales_of_a_batch_are_those_of_its_frames() -> None:
@@ -104,8 +105,8 @@ def test_scales_of_a_batch_are_those_of_its_frames() -> None:
     assert scales is not None
     with torch.inference_mode():
         found = scales(together.points, together.scales)
-        wanted = torch.cat([scales(each.points, each.scales) for each in alone])
-    torch.testing.assert_close(found, wanted, atol=1e-5, rtol=1e-4)
+        expected = torch.cat([scales(each.points, each.scales) for each in alone])
+    torch.testing.assert_close(found, expected, atol=1e-5, rtol=1e-4)
 
 
 def test_settings_that_cannot_be() -> None:

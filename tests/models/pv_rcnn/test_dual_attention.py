@@ -41,6 +41,6 @@ def test_it_is_what_the_equations_say(residual: bool) -> None:
     features = torch.randn(2, 6, 3, 4, dtype=torch.float64)
     with torch.inference_mode():
         found = module(features).numpy()
-    for one, wanted in zip(found, features.numpy(), strict=True):
-        attended = by_hand(module, wanted)
-        np.testing.assert_allclose(one, wanted + 0.1 * attended if residual else attended, atol=1e-9)
+    for one, expected in zip(found, features.numpy(), strict=True):
+        attended = by_hand(module, expected)
+        np.testing.assert_allclose(one, expected + 0.1 * attended if residual else attended, atol=1e-9)

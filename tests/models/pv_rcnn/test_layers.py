@@ -185,11 +185,11 @@ def test_an_empty_frame_changes_nothing_of_a_full_one_beside_it() -> None:
             together = detector.predict(batch(detector, *order))
             for joined, own in zip(together.maps, alone.maps, strict=True):
                 torch.testing.assert_close(joined[number], own[0], atol=1e-5, rtol=1e-4)
-            found, wanted = together.proposals[number], alone.proposals[0]
-            assert len(found) == len(wanted) > 0
-            np.testing.assert_allclose(found.boxes, wanted.boxes, atol=1e-4)
-            np.testing.assert_allclose(found.scores, wanted.scores, atol=1e-5)
-            np.testing.assert_array_equal(found.labels, wanted.labels)
+            found, expected = together.proposals[number], alone.proposals[0]
+            assert len(found) == len(expected) > 0
+            np.testing.assert_allclose(found.boxes, expected.boxes, atol=1e-4)
+            np.testing.assert_allclose(found.scores, expected.scores, atol=1e-5)
+            np.testing.assert_array_equal(found.labels, expected.labels)
             torch.testing.assert_close(together.found.confidence, alone.found.confidence, atol=1e-4, rtol=1e-3)
     for order in ((frame(0), empty), (empty, frame(0))):
         assert gradients(detector, batch(detector, *order))
@@ -208,14 +208,14 @@ def test_lower_precision_leaves_positions_alone() -> None:
 
 @pytest.mark.parametrize("variant", ["published", "VectorPool", "adaptive scales"])
 def test_learns_one_frame_by_heart(variant: str) -> None:
-    detector, wanted = tiny_detector(**VARIANTS[variant]), frame(5)
+    detector, expected = tiny_detector(**VARIANTS[variant]), frame(5)
     for module in detector.modules():
         if isinstance(module, torch.nn.BatchNorm1d | torch.nn.BatchNorm2d):
             module.momentum = 0.1  # so that a hundred steps are enough for its statistics
-    inputs = batch(detector, wanted)
+    inputs = batch(detector, expected)
     optimizer = torch.optim.Adam(detector.parameters())
     for step in range(160):
-        if step >= 40 and step % 20 == 0 and not _mistakes(detector, inputs, wanted):
+        if step >= 40 and step % 20 == 0 and not _mistakes(detector, inputs, expected):
             break
         torch.manual_seed(step)
         optimizer.param_groups[0]["lr"] = 6e-3 * (1 - step / 160)
@@ -223,21 +223,21 @@ def test_learns_one_frame_by_heart(variant: str) -> None:
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
-    assert not _mistakes(detector, inputs, wanted)
+    assert not _mistakes(detector, inputs, expected)
 
 
-def _mistakes(detector: PvRcnnDetector, inputs: LabeledVoxels, wanted: LabeledFrame) -> str:
+def _mistakes(detector: PvRcnnDetector, inputs: LabeledVoxels, expected: LabeledFrame) -> str:
     """How what is found differs from the frame's boxes; empty where each of them is found once, and nothing else."""
     with torch.inference_mode():
         (found,) = detector.eval().detect(detector.predict(inputs), SPEC.with_score_threshold(0.5))
     detector.train()
-    if len(found) != len(wanted.boxes):
+    if len(found) != len(expected.boxes):
         return f"{len(found)} boxes"
-    overlap = iou_3d(found.boxes, wanted.boxes)
+    overlap = iou_3d(found.boxes, expected.boxes)
     best = overlap.argmax(axis=0)
     if set(best) != set(range(len(best))) or overlap.max(axis=0).min() <= 0.85:
         return f"overlaps {overlap.max(axis=0)}"
-    return "" if np.array_equal(found.labels[best], wanted.labels) else f"labels {found.labels[best]}"
+    return "" if np.array_equal(found.labels[best], expected.labels) else f"labels {found.labels[best]}"
 
 
 def test_settings_that_cannot_be() -> None:

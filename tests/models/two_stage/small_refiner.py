@@ -9,7 +9,7 @@ from asca_pillars.models.two_stage.layers import BallSource, KeypointEncoder, Pi
 from asca_pillars.models.two_stage.preparation import RefineBatch, collate_samples
 from asca_pillars.models.two_stage.sets import SetAbstraction
 from asca_pillars.ops.points.sampling import farthest_points
-from asca_pillars.ops.two_stage.first_stage import Proposed
+from asca_pillars.ops.two_stage.first_stage import SecondStageInputs
 from asca_pillars.ops.two_stage.prepare import RefineSettings
 from tests.helpers.scenes import make_scene
 from tests.models.two_stage.drawn_samples import prepare_sample
@@ -29,7 +29,7 @@ def small_refiner(seed: int = 0) -> PillarRefiner:
     return PillarRefiner(encode, head)
 
 
-def proposed_frame(seed: int) -> tuple[LabeledFrame, Proposed]:
+def proposed_frame(seed: int) -> tuple[LabeledFrame, SecondStageInputs]:
     """A scene with, for each of its boxes, three proposals not quite in its place, and one in none."""
     points, boxes = make_scene(seed)[:2]
     rng = np.random.default_rng(seed)
@@ -40,7 +40,7 @@ def proposed_frame(seed: int) -> tuple[LabeledFrame, Proposed]:
     detections = Detections(moved, rng.uniform(0.1, 0.9, len(moved)).astype(np.float32), labels, NAMES)
     keypoints = np.ascontiguousarray(points[farthest_points(points, 256), :3])
     bev = rng.normal(size=(len(keypoints), BEV_CHANNELS)).astype(np.float32)
-    return LabeledFrame(f"{seed:06d}", points, boxes, LABELS), Proposed(detections, keypoints, bev)
+    return LabeledFrame(f"{seed:06d}", points, boxes, LABELS), SecondStageInputs(detections, keypoints, bev)
 
 
 def batch(seeds: tuple[int, ...]) -> RefineBatch:

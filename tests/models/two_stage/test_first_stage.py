@@ -13,14 +13,19 @@ import torch
 from asca_deploy.bundle import MANIFEST
 from asca_deploy.manifest import load_pillar_bundle
 from asca_deploy.shipped import shipped_bundles
+from asca_export.bundle_writer import ExportOptions
 from asca_export.pillar.export import export_pillar_bundle
-from asca_export.proven_bundle import ExportOptions
 from asca_export.two_stage.first_stage import BundleFirstStage, open_exported
 from asca_pillars.base.errors import BundleError, ConfigError, ExportError
 from asca_pillars.detection.proposals import ProposalSettings
 from asca_pillars.models.pillar.network import PillarDetector
 from asca_pillars.models.two_stage.first_stage import open_first_stage, with_first_stage
-from asca_pillars.ops.two_stage.first_stage import FirstPass, FirstStageSettings, proposed_from, require_pillar_kind
+from asca_pillars.ops.two_stage.first_stage import (
+    FirstStageOutputs,
+    FirstStageSettings,
+    require_pillar_kind,
+    second_stage_inputs,
+)
 from tests.export.tiny import CALIBRATION, NETWORK, SCANS, tiny_checkpoint
 from tests.helpers.saved_checkpoint import save_checkpoint
 from tests.helpers.scenes import SPEC
@@ -42,15 +47,15 @@ def test_checkpoint_and_bundle_say_the_same(tmp_path: Path, network: dict[str, A
     assert in_torch.spec == in_onnx.spec == spec
     assert in_torch.identity == in_onnx.identity
     for points in (SCANS[0], np.empty((0, 4), np.float32)):
-        wanted, found = in_torch(points), in_onnx(points)
+        expected, found = in_torch(points), in_onnx(points)
         assert found.neck.shape[-1] == 3 * NETWORK.upsample_channels
-        np.testing.assert_allclose(found.neck, wanted.neck, atol=1e-4)
-        for one, other in zip(found.maps, wanted.maps, strict=True):
+        np.testing.assert_allclose(found.neck, expected.neck, atol=1e-4)
+        for one, other in zip(found.maps, expected.maps, strict=True):
             np.testing.assert_allclose(one, other, atol=1e-3)
         if network:
-            np.testing.assert_array_equal(found.cells, wanted.cells)
+            np.testing.assert_array_equal(found.cells, expected.cells)
         else:
-            assert found.cells is None and wanted.cells is None
+            assert found.cells is None and expected.cells is None
 
 
 def test_the_same_weights_are_taken_from_any_file_and_others_are_refused(tmp_path: Path) -> None:
@@ -98,11 +103,13 @@ def test_rows_of_active_cells_are_a_map_with_zeros_beside_them(tmp_path: Path) -
         whole[:, rows.cells] = part.T
     whole_maps = type(rows.maps)(*(part.reshape(-1, height, width) for part in maps))
     settings = FirstStageSettings(ProposalSettings(score_threshold=0.0))
-    wanted = proposed_from(FirstPass(whole_maps, neck.reshape(height, width, -1)), points, SPEC, settings)
-    found = proposed_from(rows, points, SPEC, settings)
+    expected = second_stage_inputs(
+        FirstStageOutputs(whole_maps, neck.reshape(height, width, -1)), points, SPEC, settings
+    )
+    found = second_stage_inputs(rows, points, SPEC, settings)
     assert len(found.proposals) and len(found.keypoints) and 0 < len(rows.cells) < height * width
-    np.testing.assert_array_equal(found.proposals.boxes, wanted.proposals.boxes)
-    np.testing.assert_array_equal(found.bev, wanted.bev)
+    np.testing.assert_array_equal(found.proposals.boxes, expected.proposals.boxes)
+    np.testing.assert_array_equal(found.bev, expected.bev)
 
 
 def test_a_second_stage_is_not_trained_on_eight_bits() -> None:

@@ -28,8 +28,8 @@ def test_corners_are_those_of_the_decoded_box(
     box = changed(proposal, (shift, scale, turn % 1.5))  # so that front stays front, and corner 0 corner 0
     residuals = torch.from_numpy(encode_refinement(box[None], proposal[None]))
     found = corners_in_frames(residuals, torch.from_numpy(proposal[None, 3:6]).float())
-    wanted = corners(boxes_in_frames(box[None], proposal[None]))
-    np.testing.assert_allclose(found.numpy(), wanted, atol=1e-4)
+    expected = corners(boxes_in_frames(box[None], proposal[None]))
+    np.testing.assert_allclose(found.numpy(), expected, atol=1e-4)
 
 
 def test_corner_loss_by_hand() -> None:

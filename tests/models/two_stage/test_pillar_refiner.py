@@ -12,7 +12,7 @@ from asca_pillars.models.two_stage.loss import refine_loss
 from asca_pillars.models.two_stage.network import refine
 from asca_pillars.models.two_stage.preparation import collate_samples, collate_scans
 from asca_pillars.models.two_stage.sets import SetAbstraction
-from asca_pillars.ops.two_stage.first_stage import Proposed
+from asca_pillars.ops.two_stage.first_stage import SecondStageInputs
 from asca_pillars.ops.two_stage.prepare import RefineSettings, refine_scan
 from tests.models.two_stage.drawn_samples import prepare_sample
 from tests.models.two_stage.small_refiner import (
@@ -64,7 +64,7 @@ def test_gradients() -> None:
     network = PillarRefiner(encode, head).double().eval()
     settings = RefineSettings(ball_radii_m=(0.8,), ball_samples=3, grid_size=2, grid_radii_m=(1.6,), grid_samples=3)
     frame, proposed = proposed_frame(0)
-    few = Proposed(proposed.proposals, proposed.keypoints[:12], proposed.bev[:12])
+    few = SecondStageInputs(proposed.proposals, proposed.keypoints[:12], proposed.bev[:12])
     inputs = collate_scans([refine_scan(frame.points, few, few.proposals[:2], settings)])
     inputs = inputs._replace(
         **{
@@ -101,7 +101,7 @@ def test_learns_one_frame_by_heart() -> None:
 
 def test_a_scan_without_proposals() -> None:
     frame, proposed = proposed_frame(0)
-    nothing = Proposed(Detections.empty(NAMES), proposed.keypoints[:0], proposed.bev[:0])
+    nothing = SecondStageInputs(Detections.empty(NAMES), proposed.keypoints[:0], proposed.bev[:0])
     assert len(refine(small_refiner().eval(), frame.points, nothing, SETTINGS, PostProcess(), "second")) == 0
     sample = prepare_sample(frame, nothing, SETTINGS, 16, np.random.default_rng(0))
     assert len(sample.targets.rois) == 0
@@ -114,7 +114,7 @@ def test_a_frame_without_samples_in_a_batch(seeds: tuple[int, int]) -> None:
     for seed in seeds:
         frame, proposed = proposed_frame(seed)
         if seed:
-            proposed = Proposed(Detections.empty(NAMES), proposed.keypoints[:0], proposed.bev[:0])
+            proposed = SecondStageInputs(Detections.empty(NAMES), proposed.keypoints[:0], proposed.bev[:0])
         samples.append(prepare_sample(frame, proposed, SETTINGS, 16, rng))
     inputs, targets = collate_samples(samples)
     assert torch.isfinite(refine_loss(small_refiner()(inputs), targets).total)

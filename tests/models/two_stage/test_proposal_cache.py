@@ -11,7 +11,7 @@ from asca_pillars.data.boxes.box_split import BoxSplit
 from asca_pillars.data.insertion.prepared import require_writable
 from asca_pillars.data.kitti import KittiSplit
 from asca_pillars.models.two_stage.proposal_cache import ProposalCache
-from asca_pillars.ops.two_stage.first_stage import FirstStageSettings, propose_on
+from asca_pillars.ops.two_stage.first_stage import FirstStageSettings, run_first_stage
 from asca_pillars.scans.scan_reader import write_scan
 from tests.data.boxes.box_scenes import write_box_dataset
 from tests.helpers.scenes import SPEC, write_dataset
@@ -28,12 +28,12 @@ def test_reads_what_was_computed(split: KittiSplit, tmp_path: Path) -> None:
     cache = ProposalCache(tmp_path / "prepared", "pool", stage, SETTINGS)
     cache.fill(split)
     for frame_id in split.frame_ids:
-        wanted = propose_on(RandomStage(), split.points(frame_id, camera_view=True), SETTINGS)
+        expected = run_first_stage(RandomStage(), split.points(frame_id, camera_view=True), SETTINGS)
         found = cache.files.read(frame_id)
         for name in ("boxes", "scores", "labels"):
-            np.testing.assert_array_equal(getattr(found.proposals, name), getattr(wanted.proposals, name))
-        np.testing.assert_array_equal(found.keypoints, wanted.keypoints)
-        np.testing.assert_allclose(found.bev, wanted.bev, rtol=1e-3, atol=1e-6)
+            np.testing.assert_array_equal(getattr(found.proposals, name), getattr(expected.proposals, name))
+        np.testing.assert_array_equal(found.keypoints, expected.keypoints)
+        np.testing.assert_allclose(found.bev, expected.bev, rtol=1e-3, atol=1e-6)
 
 
 def test_several_processes_write_the_same(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ import pytest
 from asca_pillars.base.errors import ConfigError
 from asca_pillars.data.frames import LabeledFrame
 from asca_pillars.models.two_stage.preparation import RefineSample, collate_samples, collate_scans
-from asca_pillars.ops.two_stage.first_stage import propose_on
+from asca_pillars.ops.two_stage.first_stage import run_first_stage
 from asca_pillars.ops.two_stage.prepare import RefineScan, RefineSettings, refine_scan, roi_features
 from tests.helpers.scenes import make_scene
 from tests.models.two_stage.drawn_samples import prepare_sample
@@ -20,7 +20,7 @@ GEOMETRY = RefineSettings(ball_samples=6, grid_size=2, grid_samples=5)
 def sample(seed: int, draw: int = 0) -> RefineSample:
     points, boxes = make_scene(seed)[:2]
     frame = LabeledFrame(f"{seed:06d}", points, boxes, np.array([0, 0, 1, 2]))
-    proposed = propose_on(RandomStage(), points, SETTINGS)
+    proposed = run_first_stage(RandomStage(), points, SETTINGS)
     return prepare_sample(frame, proposed, GEOMETRY, 12, np.random.default_rng(draw))
 
 
@@ -36,7 +36,7 @@ def test_a_sample_depends_on_its_generator_alone() -> None:
 
 def test_points_that_no_ball_reaches_are_left_out_and_no_others() -> None:
     points = make_scene(0)[0]
-    proposed = propose_on(RandomStage(), points, SETTINGS)
+    proposed = run_first_stage(RandomStage(), points, SETTINGS)
     found = refine_scan(points, proposed, proposed.proposals, GEOMETRY)
     away = np.linalg.norm(found.keypoints[:, None] - points[None, :, :3], axis=2)
     for radius_m, indices in zip(GEOMETRY.ball_radii_m, found.ball_indices, strict=True):
@@ -47,7 +47,7 @@ def test_points_that_no_ball_reaches_are_left_out_and_no_others() -> None:
 
 def test_a_second_thread_finds_the_same_neighbors() -> None:
     points = make_scene(0)[0]
-    proposed = propose_on(RandomStage(), points, SETTINGS)
+    proposed = run_first_stage(RandomStage(), points, SETTINGS)
     alone = refine_scan(points, proposed, proposed.proposals, GEOMETRY)
     with ThreadPoolExecutor(1) as executor:
         found = refine_scan(points, proposed, proposed.proposals, GEOMETRY, executor)
@@ -79,7 +79,7 @@ def test_shapes_of_a_batch() -> None:
 
 
 def test_roi_features() -> None:
-    proposals = propose_on(RandomStage(), make_scene(0)[0], SETTINGS).proposals
+    proposals = run_first_stage(RandomStage(), make_scene(0)[0], SETTINGS).proposals
     features = roi_features(proposals)
     assert (features[:, :3].argmax(axis=1) == proposals.labels).all()
     np.testing.assert_allclose(1 / (1 + np.exp(-features[:, 3])), proposals.scores, rtol=1e-4)

@@ -16,8 +16,8 @@ def cells(share: float, seed: int) -> np.ndarray:
     return np.flatnonzero(np.random.default_rng(seed).random(NY * NX) < share)
 
 
-def arrays(tables: NeckRulebooks[np.ndarray]) -> list[np.ndarray]:
-    return [*(part for level in tables.levels for part in level), tables.head_cells]
+def arrays(rulebooks: NeckRulebooks[np.ndarray]) -> list[np.ndarray]:
+    return [*(part for level in rulebooks.levels for part in level), rulebooks.head_cells]
 
 
 @settings(max_examples=60, deadline=None)
@@ -26,17 +26,17 @@ def test_active_cells_follow_the_rule(seed: int, share: float, rule: MaskRule) -
     mask = torch.zeros(NY * NX)
     mask[torch.from_numpy(cells(share, seed))] = 1
     level, outputs = mask.view(1, 1, NY, NX), []
-    tables = NeckRulebookBuilder(NY, NX, rule).build(cells(share, seed))
-    for number, found in enumerate(tables.levels):
+    rulebooks = NeckRulebookBuilder(NY, NX, rule).build(cells(share, seed))
+    for number, found in enumerate(rulebooks.levels):
         level = F.max_pool2d(level, 3, 2, 1)  # a strided output is active where it sees an active input
         outputs.append(F.max_pool2d(level, 3, 1, 1) if rule == "fine" and number == 0 else level)
         np.testing.assert_array_equal(found.strided_cells, level.flatten().nonzero()[:, 0])
         np.testing.assert_array_equal(found.cells, outputs[-1].flatten().nonzero()[:, 0])
     upsampled = [F.interpolate(output, (NY // 2, NX // 2)) for output in outputs]
-    np.testing.assert_array_equal(tables.head_cells, torch.stack(upsampled).amax(0).flatten().nonzero()[:, 0])
-    for number, (found, seen) in enumerate(zip(tables.levels, upsampled, strict=True)):
+    np.testing.assert_array_equal(rulebooks.head_cells, torch.stack(upsampled).amax(0).flatten().nonzero()[:, 0])
+    for number, (found, seen) in enumerate(zip(rulebooks.levels, upsampled, strict=True)):
         missing = found.places == len(found.cells) * 4**number
-        np.testing.assert_array_equal(~missing, seen.flatten()[torch.from_numpy(tables.head_cells).long()] > 0)
+        np.testing.assert_array_equal(~missing, seen.flatten()[torch.from_numpy(rulebooks.head_cells).long()] > 0)
 
 
 def test_only_training_asks_for_inverse_tables() -> None:

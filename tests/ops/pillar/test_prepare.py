@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from asca_pillars.base.errors import ConfigError
 from asca_pillars.ops.pillar.grid import PillarGrid
-from asca_pillars.ops.pillar.prepare import FEATURES, PillarCounts, PillarLimits, Pillars, evenly, pillarize
+from asca_pillars.ops.pillar.prepare import FEATURES, PillarCounts, PillarLimits, Pillars, evenly_spaced_mask, pillarize
 
 GRID = PillarGrid(x_range_m=(2.0, 17.36), y_range_m=(-3.2, 7.04), z_range_m=(-2.5, 1.5))
 NO_LIMITS = PillarLimits(max_pillars=10**9, max_points=10**9)
@@ -126,7 +126,7 @@ def test_every_part_of_a_crowd_keeps_its_share() -> None:
 
 @given(st.integers(1, 500), st.integers(1, 600))
 def test_an_even_subset_has_steps_that_differ_by_one(count: int, most: int) -> None:
-    stays = np.flatnonzero(evenly(np.arange(count), count, most))
+    stays = np.flatnonzero(evenly_spaced_mask(np.arange(count), count, most))
     assert len(stays) == min(count, most)
     steps = np.diff(stays, prepend=-1)
     assert steps.max() - steps.min() <= 1

@@ -25,8 +25,8 @@ def test_every_ball_is_in_the_narrowest_group_with_room(
     balls, widths = group_balls(indices, len(points)), group_widths(samples)
     members = [row for group in balls.groups for row in group.members]
     assert sorted(balls.rows.tolist()) == list(range(len(queries))) and len(members) == len(queries)
-    for wanted, row in zip(indices, balls.rows, strict=True):
-        different = set(wanted.tolist())
+    for expected, row in zip(indices, balls.rows, strict=True):
+        different = set(expected.tolist())
         assert set(members[row].tolist()) == different
         assert len(members[row]) == min(width for width in widths if width >= len(different))
     around = np.concatenate([group.queries for group in balls.groups])[balls.rows]

@@ -61,8 +61,8 @@ def test_three_nearest(points: np.ndarray, queries: np.ndarray) -> None:
     assert (indices == in_numpy).all()
     assert weights.tobytes() == numpy_weights.tobytes()
     there = min(3, len(points))
-    wanted = np.argsort(distances(points, queries), axis=1, kind="stable")[:, :there]
-    assert (indices[:, :there] == wanted).all()
+    expected = np.argsort(distances(points, queries), axis=1, kind="stable")[:, :there]
+    assert (indices[:, :there] == expected).all()
     assert (indices[:, there:] == len(points)).all()
     assert (weights[:, there:] == 0).all()
     if there:

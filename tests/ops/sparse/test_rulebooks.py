@@ -47,13 +47,13 @@ def test_a_convolution_by_table_is_the_dense_one(seed: int, share: float, shape:
                     stride=conv.stride, padding=conv.padding)  # fmt: skip
     np.testing.assert_array_equal(target.cells, np.flatnonzero(seen[0, 0].permute(1, 2, 0).reshape(-1) > 0))
 
-    table = target.table(source, conv.inputs(target.shape, source.shape))
+    table = target.rulebook(source, conv.inputs(target.shape, source.shape))
     assert table.shape == (len(target), conv.taps) and table.dtype == np.int32
     gathered = np.vstack([features, np.zeros((1, 3))])[table]  # (M, K, C)
     found = np.einsum("mkc,ock->mo", gathered, weight.reshape(4, 3, -1))
     np.testing.assert_allclose(found, at_cells(expected, target.cells), atol=1e-10)
 
-    back = source.table(target, conv.outputs(source.shape, target.shape))
+    back = source.rulebook(target, conv.outputs(source.shape, target.shape))
     forward = {(row, tap, i) for (row, tap), i in np.ndenumerate(table) if i < len(source)}
     assert forward == {(row, tap, i) for (i, tap), row in np.ndenumerate(back) if row < len(target)}
 
@@ -63,7 +63,7 @@ def test_a_submanifold_table_is_its_own_inverse_with_the_taps_reversed(share: fl
     cells = CellMap((5, 8, 6))
     cells.activate(random_cells((5, 8, 6), share, seed=3))
     shape = cells.shape
-    forward, back = cells.table(cells, SUBMANIFOLD.inputs(shape, shape)), cells.table(
+    forward, back = cells.rulebook(cells, SUBMANIFOLD.inputs(shape, shape)), cells.rulebook(
         cells, SUBMANIFOLD.outputs(shape, shape)
     )  # fmt: skip
     np.testing.assert_array_equal(forward[:, ::-1], back)
@@ -83,8 +83,8 @@ def test_numpy_finds_the_same_bits(seed: int, share: float, earlier: float, shap
             target.activate_joined([(source, conv.outputs(shape, output_shape))])
             results.append((
                 target.cells,
-                target.table(source, conv.inputs(output_shape, shape)),
-                source.table(target, conv.outputs(shape, output_shape)),
+                target.rulebook(source, conv.inputs(output_shape, shape)),
+                source.rulebook(target, conv.outputs(shape, output_shape)),
             ))  # fmt: skip
         for one, other in zip(*results, strict=True):
             assert one.dtype == other.dtype

@@ -7,13 +7,18 @@ from numpy.typing import NDArray
 from asca_pillars.base.errors import ConfigError
 from asca_pillars.detection.proposals import ProposalSettings
 from asca_pillars.geometry.overlap import bev_iou
-from asca_pillars.ops.two_stage.first_stage import FirstPass, FirstStageSettings, KeypointSettings, propose_on
+from asca_pillars.ops.two_stage.first_stage import (
+    FirstStageOutputs,
+    FirstStageSettings,
+    KeypointSettings,
+    run_first_stage,
+)
 from tests.helpers.scenes import SPEC, make_scene
 from tests.models.two_stage.random_stage import CHANNELS, SETTINGS, RandomStage
 
 
 def test_quotas_and_suppression() -> None:
-    found = propose_on(RandomStage(), make_scene(0)[0], SETTINGS).proposals
+    found = run_first_stage(RandomStage(), make_scene(0)[0], SETTINGS).proposals
     settings = SETTINGS.proposals
     assert np.bincount(found.labels).tolist() == list(settings.quotas), "noise fills every quota"
     assert found.scores.min() >= settings.score_threshold
@@ -25,7 +30,7 @@ def test_quotas_and_suppression() -> None:
 
 def test_keypoints_are_points_near_proposals_with_the_map_below_them() -> None:
     points, stage = make_scene(0)[0], RandomStage()
-    found = propose_on(stage, points, SETTINGS)
+    found = run_first_stage(stage, points, SETTINGS)
     assert 0 < len(found.keypoints) <= 64
     assert (found.keypoints[:, None] == points[None, :, :3]).all(axis=2).any(axis=1).all()
     away = np.linalg.norm(found.keypoints[:, None, :2] - found.proposals.boxes[None, :, :2], axis=2)
@@ -49,14 +54,14 @@ def test_keypoints_are_points_near_proposals_with_the_map_below_them() -> None:
 class PlacesStage(RandomStage):
     """Its neck says of each cell where it is."""
 
-    def __call__(self, points: NDArray[np.float32]) -> FirstPass:
+    def __call__(self, points: NDArray[np.float32]) -> FirstStageOutputs:
         x_m, y_m = SPEC.head_centers_m()
         neck = np.stack(np.meshgrid(x_m, y_m), axis=-1).astype(np.float32)
         return super().__call__(points)._replace(neck=neck)
 
 
 def test_a_keypoint_reads_the_neck_at_its_own_place() -> None:
-    found = propose_on(PlacesStage(), make_scene(0)[0], SETTINGS)
+    found = run_first_stage(PlacesStage(), make_scene(0)[0], SETTINGS)
     own = found.keypoints[:, :2]
     lowest, highest = np.array([(centers[0], centers[-1]) for centers in SPEC.head_centers_m()]).T
     between = ((own > lowest) & (own < highest)).all(axis=1)
@@ -65,14 +70,14 @@ def test_a_keypoint_reads_the_neck_at_its_own_place() -> None:
 
 
 def test_an_empty_scan() -> None:
-    found = propose_on(RandomStage(), np.empty((0, 4), np.float32), SETTINGS)
+    found = run_first_stage(RandomStage(), np.empty((0, 4), np.float32), SETTINGS)
     assert found.keypoints.shape == (0, 3)
     assert found.bev.shape == (0, CHANNELS)
 
 
 def test_nothing_proposed() -> None:
     settings = FirstStageSettings(ProposalSettings(score_threshold=1.0))
-    found = propose_on(RandomStage(), make_scene(0)[0], settings)
+    found = run_first_stage(RandomStage(), make_scene(0)[0], settings)
     assert len(found.proposals) == len(found.keypoints) == 0
 
 

@@ -60,20 +60,20 @@ def test_no_objects() -> None:
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(1, 200), st.integers(0, 7), st.integers(1, 128))
-def test_quotas(seed: int, count: int, kinds: int, wanted: int) -> None:
+def test_quotas(seed: int, count: int, kinds: int, expected: int) -> None:
     found = overlaps(seed, count, kinds)
-    rois = sample_rois(found, wanted, np.random.default_rng(seed))
-    again = sample_rois(found, wanted, np.random.default_rng(seed))
+    rois = sample_rois(found, expected, np.random.default_rng(seed))
+    again = sample_rois(found, expected, np.random.default_rng(seed))
     assert rois.tolist() == again.tolist()
     usable = found.iou[~found.ignored]
-    assert len(rois) == (wanted if len(usable) else 0)
+    assert len(rois) == (expected if len(usable) else 0)
     assert not found.ignored[rois].any()
     drawn = found.iou[rois]
     foreground = drawn[drawn >= FOREGROUND_IOU]
     background = drawn[drawn < FOREGROUND_IOU]
     there = (usable >= FOREGROUND_IOU).sum()
     if (usable < FOREGROUND_IOU).any() and len(rois):
-        assert len(foreground) == min(there, round(wanted / 2))
+        assert len(foreground) == min(there, round(expected / 2))
         assert len(np.unique(rois[drawn >= FOREGROUND_IOU])) == len(foreground)
         hard, easy = (usable < FOREGROUND_IOU) & (usable >= HARD_IOU), usable < HARD_IOU
         if hard.any() and easy.any():

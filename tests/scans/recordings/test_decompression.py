@@ -159,9 +159,9 @@ def test_files_with_damage(tmp_path: Path, suffix: str) -> None:
 def test_unpacking_is_said(tmp_path: Path) -> None:
     folder = rosbag2(tmp_path / "bag", "MCAP", "FILE")
     recording = open_recording(folder)
-    _, said = RecordedScans(recording, recording.point_cloud_topic(), 1.0).mounting(ScanSettings())
-    assert said[0].startswith(f"{folder / 'bag.mcap.zstd'}: unpacked to {tempfile.gettempdir()}/asca-unpacked-")
-    assert said[1] == "/lidar: 3 scans"
+    _, notes = RecordedScans(recording, recording.point_cloud_topic(), 1.0).mounting(ScanSettings())
+    assert notes[0].startswith(f"{folder / 'bag.mcap.zstd'}: unpacked to {tempfile.gettempdir()}/asca-unpacked-")
+    assert notes[1] == "/lidar: 3 scans"
     (folder / "bag.mcap").write_bytes(decompress_zstd((folder / "bag.mcap.zstd").read_bytes()))
     assert open_recording(folder).notes == ()
 

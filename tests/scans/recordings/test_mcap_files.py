@@ -76,7 +76,7 @@ def test_a_topic_without_a_schema_that_holds_something_else(tmp_path: Path) -> N
     data = bytes(store().serialize_cdr(message, "std_msgs/msg/String"))
     recording = open_recording(write_mcap(tmp_path / "a.mcap", {"/note": [(5, data)]}, has_schema=False))
     (one,) = RecordedScans(recording, recording.point_cloud_topic("/note"), 1.0).read()
-    assert one.scan is None and "no readable PointCloud2" in str(one.trouble)
+    assert one.scan is None and "no readable PointCloud2" in str(one.error_text)
 
 
 @pytest.mark.parametrize(

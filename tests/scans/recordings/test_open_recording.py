@@ -201,8 +201,8 @@ def test_scans_that_cannot_be_read_are_told_one_by_one(tmp_path: Path) -> None:
     recording = open_recording(write_mcap(tmp_path / "a.mcap", {"/lidar": messages}))
     scans = list(RecordedScans(recording, recording.point_cloud_topic(), "auto").read())
     assert [one.scan is None for one in scans] == [False, True, True]
-    assert "a.mcap, /lidar, message 1: no readable PointCloud2" in str(scans[1].trouble)
-    assert "message 2: no field z" in str(scans[2].trouble)
+    assert "a.mcap, /lidar, message 1: no readable PointCloud2" in str(scans[1].error_text)
+    assert "message 2: no field z" in str(scans[2].error_text)
 
 
 def test_messages_that_cannot_be_read_are_not_tried_without_end(

@@ -172,10 +172,10 @@ class PacketRecording(Recording):
         return Message(time_ns, bytes(self._types.serialize_cdr(self._types.types[kind](**values), kind)), "cdr")
 
 
-@pytest.mark.parametrize(("metadata", "said"), [(None, "no metadata of the Ouster"), ("{}", "no readable metadata")])
-def test_packets_of_an_ouster_in_a_recording_need_its_metadata(metadata: str | None, said: str) -> None:
+@pytest.mark.parametrize(("metadata", "message"), [(None, "no metadata of the Ouster"), ("{}", "no readable metadata")])
+def test_packets_of_an_ouster_in_a_recording_need_its_metadata(metadata: str | None, message: str) -> None:
     recording = PacketRecording(metadata, [])
-    with pytest.raises(ScanError, match=f"/ouster/metadata: {said}"):
+    with pytest.raises(ScanError, match=f"/ouster/metadata: {message}"):
         RecordedScans(recording, recording.point_cloud_topic(), "auto")
 
 

@@ -65,7 +65,7 @@ def test_frames_that_are_not_known_are_refused(tmp_path: Path) -> None:
         scans(path, "car")
     (one,) = scans(path, "base_link").read()
     assert one.scan is None
-    assert "no static transform leads from lidar to base_link; there are base_link, camera" in str(one.trouble)
+    assert "no static transform leads from lidar to base_link; there are base_link, camera" in str(one.error_text)
 
 
 def test_transforms_of_ros_1_are_read(tmp_path: Path) -> None:

@@ -57,7 +57,7 @@ def test_a_row_without_usable_data_costs_its_scan_alone(tmp_path: Path, data: An
     found = scans(database(tmp_path / "a.db3", ("UPDATE messages SET data = ? WHERE id = 3", (data,))))
     assert [one.scan is not None for one in found] == [True, True, False, True, True]
     assert [one.time_ns for one in found] == stamps(5)
-    assert "a.db3, /lidar, message 2" in str(found[2].trouble)
+    assert "a.db3, /lidar, message 2" in str(found[2].error_text)
 
 
 @pytest.mark.parametrize("time_ns", [None, 1e300, 1.5, -1, -(2**63), "soon", b"\xff"], ids=str)

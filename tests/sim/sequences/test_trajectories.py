@@ -10,7 +10,7 @@ from asca_pillars.sim.sequences.moving_scene import (
     FAR_M,
     RING_M,
     TRAVEL_M,
-    Way,
+    Trajectory,
     draw_moving_scene,
     held_footprints,
 )
@@ -24,13 +24,13 @@ def scene(seed: int, duration_s: float = 8.0):
 
 
 def test_a_way_stops_at_its_ends() -> None:
-    places = Way(1.0, 2.0, np.pi / 2, 2.0, -1.0, 3.0).at(np.array([-2.0, -0.5, 0.0, 1.0, 5.0]))
+    places = Trajectory(1.0, 2.0, np.pi / 2, 2.0, -1.0, 3.0).at(np.array([-2.0, -0.5, 0.0, 1.0, 5.0]))
     assert places.xy_m[:, 1] == pytest.approx([1.0, 1.0, 2.0, 4.0, 5.0])
     assert places.speed_mps.tolist() == [0.0, 2.0, 2.0, 2.0, 0.0]
 
 
 def test_traffic_comes_back_as_somebody_else() -> None:
-    places = Way(100.0, 2.0, 0.0, 10.0, ring=True).at(np.array([0.0, 1.0, 2.0, 30.0]))
+    places = Trajectory(100.0, 2.0, 0.0, 10.0, ring=True).at(np.array([0.0, 1.0, 2.0, 30.0]))
     assert places.xy_m[:, 0] == pytest.approx([100.0, 110.0, 120.0 - RING_M, 400.0 - 2 * RING_M])
     assert places.laps.tolist() == [0, 0, 1, 2]
 
@@ -74,7 +74,7 @@ def test_objects_go_where_their_velocity_says_and_keep_their_size(seed: int) -> 
 
 
 def test_held_footprints_cover_the_way() -> None:
-    way = Way(3.0, -2.0, 0.4, 5.0, -4.0, np.inf)
+    way = Trajectory(3.0, -2.0, 0.4, 5.0, -4.0, np.inf)
     held = shapely.union_all(
         [polygon(np.array([x, y, 0, a, b, 1, yaw])) for x, y, a, b, yaw in held_footprints(way, (2.0, 1.0), 10.0)]
     )

@@ -13,27 +13,27 @@ from torch import Tensor
 
 from asca_pillars.base.errors import TrainingError
 from asca_pillars.config.pillar import PillarModel
-from asca_pillars.models.openpcdet.links import Link, map_links, norm_links
+from asca_pillars.models.openpcdet.key_mapping import KeyMapping, map_backbone_keys, norm_keys
 from asca_pillars.ops.pillar.prepare import FEATURES
 
 _Z = FEATURES.index("z")
 _X_CENTER, _Z_CENTER = FEATURES.index("x_center"), len(FEATURES)  # the last is the one feature that ours does not have
 
 
-def pointpillars_links(model: PillarModel, state: Mapping[str, Tensor]) -> Iterator[Link]:
-    """Yield the links for `build_pillar_detector(model)` from `state`, OpenPCDet's unitless weights (out, in, ...).
+def pointpillars_keys(model: PillarModel, state: Mapping[str, Tensor]) -> Iterator[KeyMapping]:
+    """Yield the mappings for `build_pillar_detector(model)` from `state`, OpenPCDet's unitless weights (out, in, ...).
 
     Raises:
         TrainingError: points with other features.
     """
-    yield from encoder_links(model, state, "vfe.pfn_layers.0")
-    yield from map_links(model.network.block_convs)
+    yield from encoder_keys(model, state, "vfe.pfn_layers.0")
+    yield from map_backbone_keys(model.network.block_convs)
 
 
-def encoder_links(
+def encoder_keys(
     model: PillarModel, state: Mapping[str, Tensor], layer: str, *, legacy: bool = False
-) -> Iterator[Link]:
-    """Yield the links of the layer on points.
+) -> Iterator[KeyMapping]:
+    """Yield the key mappings of the layer on points.
 
     Args:
         model: ours.
@@ -69,11 +69,11 @@ def encoder_links(
         merged[:, _Z] += merged[:, _Z_CENTER]
         return merged[:, :_Z_CENTER]
 
-    yield Link(name, "encode.linear.weight", linear)
-    for link in norm_links(f"{layer}.norm", "encode.norm"):
-        if link.target.endswith("running_mean"):
-            yield link._replace(convert=lambda mean: mean + of_height(state[name]))
+    yield KeyMapping(name, "encode.linear.weight", linear)
+    for mapping in norm_keys(f"{layer}.norm", "encode.norm"):
+        if mapping.target.endswith("running_mean"):
+            yield mapping._replace(convert=lambda mean: mean + of_height(state[name]))
         else:
-            yield link
+            yield mapping
     if model.network.empty_slots:
-        yield Link(name, "encode.empty_slot", of_height)
+        yield KeyMapping(name, "encode.empty_slot", of_height)

@@ -28,7 +28,7 @@ LICENSE = "Apache-2.0"
 B = TypeVar("B", bound=Bundle)
 
 
-def _silent(_: str) -> None:
+def _ignore_progress(_: str) -> None:
     pass
 
 
@@ -51,7 +51,7 @@ class ExportOptions:
     calibration: Sequence[NDArray[np.float32]] | None = None
     dense_neck: bool = False
     weights: Path | None = None
-    progress: Callable[[str], None] = _silent
+    progress: Callable[[str], None] = _ignore_progress
 
 
 DEFAULTS = ExportOptions()
@@ -111,13 +111,13 @@ def draft_bundle(
     )
 
 
-def write_proven(folder: Path, draft: B, prove: Callable[[B], Parity], weights: Path | None) -> B:
-    """Sign the graphs in `folder`, and write their manifest with the parity that `prove` finds as the runtime opens it.
+def write_bundle(folder: Path, draft: B, compare: Callable[[B], Parity], weights: Path | None) -> B:
+    """Sign the graphs in `folder`; write their manifest with the parity that `compare` finds as the runtime opens it.
 
     Args:
         folder: with the graphs.
         draft: the manifest.
-        prove: compares the opened bundle with PyTorch.
+        compare: compares the opened bundle with PyTorch.
         weights: as in `ExportOptions`.
 
     Raises:
@@ -132,6 +132,6 @@ def write_proven(folder: Path, draft: B, prove: Callable[[B], Parity], weights: 
     write_bundle_manifest(folder, signed)
     opened = load_bundle(folder)
     assert isinstance(opened, type(draft)), "as it was written"
-    bundle = dataclasses.replace(signed, parity=prove(opened))
+    bundle = dataclasses.replace(signed, parity=compare(opened))
     write_bundle_manifest(folder, bundle)
     return bundle

@@ -13,62 +13,62 @@ _WITHOUT_EFFECT = ("global_step",)  # OpenPCDet's counter of training steps lies
 _NAMED = 5  # mismatched names in an error, at most
 
 
-def as_it_is(array: Tensor) -> Tensor:
+def identity(array: Tensor) -> Tensor:
     """Return unitless weights (out, in, ...), and arrays of any other shape, unchanged."""
     return array
 
 
-def without_singletons(array: Tensor) -> Tensor:
+def squeeze_kernel(array: Tensor) -> Tensor:
     """Reshape a 1x1 convolution's unitless weight (out, in, 1, ...) to a linear layer's (out, in)."""
     return array.flatten(1) if array.shape[2:].numel() == 1 else array
 
 
-class Link(NamedTuple):
+class KeyMapping(NamedTuple):
     """Mapping of one array: source name, target name, conversion."""
 
     source: str
     target: str
-    convert: Callable[[Tensor], Tensor] = as_it_is
+    convert: Callable[[Tensor], Tensor] = identity
 
 
-def norm_links(source: str, target: str) -> Iterator[Link]:
-    """Return the links of a normalization layer."""
-    return (Link(f"{source}.{part}", f"{target}.{part}") for part in _NORM_PARTS)
+def norm_keys(source: str, target: str) -> Iterator[KeyMapping]:
+    """Return the key mappings of a normalization layer."""
+    return (KeyMapping(f"{source}.{part}", f"{target}.{part}") for part in _NORM_PARTS)
 
 
 def convert_state(
-    state: Mapping[str, Tensor], links: Iterable[Link], wanted: Mapping[str, Tensor], blamed: str
+    state: Mapping[str, Tensor], key_mappings: Iterable[KeyMapping], our_state: Mapping[str, Tensor], path_text: str
 ) -> dict[str, Tensor]:
     """Convert their state dict to ours; every array of theirs is used, or named in the error.
 
     Args:
         state: theirs by name: unitless weights (out, in, ...) and the (C,) values of normalizations.
-        links: what becomes what.
-        wanted: our state dict, for names and shapes.
-        blamed: the file, for messages.
+        key_mappings: what becomes what.
+        our_state: our state dict, for names and shapes.
+        path_text: the file, for messages.
 
     Raises:
         TrainingError: an array is missing, unknown, or of another shape than the configuration asks for.
     """
-    links = list(links)
-    known = {link.source for link in links}
+    key_mappings = list(key_mappings)
+    known = {mapping.source for mapping in key_mappings}
     if missing := [name for name in known if name not in state]:
-        raise TrainingError(f"{blamed}: lacks {_some(missing)}; the network of --config has other layers")
+        raise TrainingError(f"{path_text}: lacks {_some(missing)}; the network of --config has other layers")
     if unknown := [name for name in state if name not in known and not _is_counter(name)]:
         raise TrainingError(
-            f"{blamed}: {_some(unknown)}: no place for it in the network of --config; nothing is imported in part"
+            f"{path_text}: {_some(unknown)}: no place for it in the network of --config; nothing is imported in part"
         )
     converted = {}
-    for source, target, convert in links:
+    for source, target, convert in key_mappings:
         found = convert(state[source])
-        if found.shape != wanted[target].shape:
+        if found.shape != our_state[target].shape:
             raise TrainingError(
-                f"{blamed}: {source} has shape {tuple(state[source].shape)}, which does not fit {target} "
-                f"{tuple(wanted[target].shape)}; give the model's configuration with --config"
+                f"{path_text}: {source} has shape {tuple(state[source].shape)}, which does not fit {target} "
+                f"{tuple(our_state[target].shape)}; give the model's configuration with --config"
             )
-        converted[target] = found.to(wanted[target].dtype).contiguous()
-    counters = {name: value for name, value in wanted.items() if name.endswith(_COUNTER)}
-    assert converted.keys() | counters.keys() == wanted.keys(), "a part of our network has no link"
+        converted[target] = found.to(our_state[target].dtype).contiguous()
+    counters = {name: value for name, value in our_state.items() if name.endswith(_COUNTER)}
+    assert converted.keys() | counters.keys() == our_state.keys(), "a part of our network has no mapping"
     return counters | converted
 
 
@@ -85,8 +85,8 @@ def _some(names: Iterable[str]) -> str:
 _HEADS = {"scores": "conv_cls", "boxes": "conv_box", "directions": "conv_dir_cls"}
 
 
-def map_links(block_convs: Sequence[int], first: Callable[[Tensor], Tensor] = as_it_is) -> Iterator[Link]:
-    """Yield the links of `backbone_2d` and `dense_head`.
+def map_backbone_keys(block_convs: Sequence[int], first: Callable[[Tensor], Tensor] = identity) -> Iterator[KeyMapping]:
+    """Yield the key mappings of `backbone_2d` and `dense_head`.
 
     Args:
         block_convs: convolutions of each block after its first.
@@ -96,15 +96,15 @@ def map_links(block_convs: Sequence[int], first: Callable[[Tensor], Tensor] = as
     for block, convs in enumerate(block_convs):
         there, here = f"backbone_2d.blocks.{block}", f"neck.blocks.{block}"
         for layer in range(0, 3 * (convs + 1), 3):  # convolution, normalization, ReLU; theirs begins with a padding
-            convert = first if block == layer == 0 else as_it_is
-            yield Link(f"{there}.{layer + 1}.weight", f"{here}.{layer}.weight", convert)
-            yield from norm_links(f"{there}.{layer + 2}", f"{here}.{layer + 1}")
+            convert = first if block == layer == 0 else identity
+            yield KeyMapping(f"{there}.{layer + 1}.weight", f"{here}.{layer}.weight", convert)
+            yield from norm_keys(f"{there}.{layer + 2}", f"{here}.{layer + 1}")
         there, here = f"backbone_2d.deblocks.{block}", f"neck.deblocks.{block}"
-        yield Link(f"{there}.0.weight", f"{here}.0.weight")
-        yield from norm_links(f"{there}.1", f"{here}.1")
+        yield KeyMapping(f"{there}.0.weight", f"{here}.0.weight")
+        yield from norm_keys(f"{there}.1", f"{here}.1")
     for here, there in _HEADS.items():
         for part in ("weight", "bias"):
-            yield Link(f"dense_head.{there}.{part}", f"head.{here}.{part}")
+            yield KeyMapping(f"dense_head.{there}.{part}", f"head.{here}.{part}")
 
 
 _LAYOUTS = (

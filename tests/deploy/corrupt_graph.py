@@ -9,7 +9,7 @@ from asca_deploy.manifest import load_pillar_bundle
 from tests.deploy.conftest import sign
 
 
-def respoil(bundle: Path, graph: str, spoil: Callable[[onnx.ModelProto], None]) -> Path:
+def corrupt_graph(bundle: Path, graph: str, spoil: Callable[[onnx.ModelProto], None]) -> Path:
     """Change a graph and sign it again, so that only its contents are wrong."""
     good = load_pillar_bundle(bundle)
     model = onnx.load(bundle / graph)

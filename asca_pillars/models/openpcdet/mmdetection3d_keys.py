@@ -12,9 +12,9 @@ from torch import Tensor
 from asca_pillars.base.errors import TrainingError
 from asca_pillars.config.pillar import PillarModel
 from asca_pillars.config.pv_rcnn import PvRcnnModel
-from asca_pillars.models.openpcdet.links import Link, map_links
-from asca_pillars.models.openpcdet.pointpillars_links import encoder_links
-from asca_pillars.models.openpcdet.pv_rcnn_links import pv_rcnn_links
+from asca_pillars.models.openpcdet.key_mapping import KeyMapping, map_backbone_keys
+from asca_pillars.models.openpcdet.pointpillars_keys import encoder_keys
+from asca_pillars.models.openpcdet.pv_rcnn_keys import pv_rcnn_keys
 
 _ENCODER, _VOXELS = "voxel_encoder.pfn_layers.0", "middle_encoder"
 FIRST_LINEAR = f"{_ENCODER}.linear.weight"
@@ -55,28 +55,32 @@ _NAMES: tuple[tuple[str, _Name], ...] = (
 """Prefixes of OpenPCDet's names, and their replacements."""
 
 
-def mmdetection3d_links(
-    model: PillarModel | PvRcnnModel, state: Mapping[str, Tensor], wanted: Mapping[str, Tensor], *, legacy: bool = True
-) -> Iterator[Link]:
-    """Yield the links for our network of this model.
+def mmdetection3d_keys(
+    model: PillarModel | PvRcnnModel,
+    state: Mapping[str, Tensor],
+    our_state: Mapping[str, Tensor],
+    *,
+    legacy: bool = True,
+) -> Iterator[KeyMapping]:
+    """Yield the key mappings for our network of this model.
 
     Args:
         model: ours.
         state: their unitless weights (out, in, ...) by name.
-        wanted: ours, likewise.
-        legacy: their encoder's flag of that name, see `encoder_links`; true unless a configuration says otherwise.
+        our_state: ours, likewise.
+        legacy: their encoder's flag of that name, see `encoder_keys`; true unless a configuration says otherwise.
 
     Raises:
         TrainingError: points with other features.
     """
     if isinstance(model, PillarModel):
         _refuse_old_axes(state)
-        yield from encoder_links(model, state, _ENCODER, legacy=legacy)
-        yield from (_renamed(link, "bbox_head") for link in map_links(model.network.block_convs))
+        yield from encoder_keys(model, state, _ENCODER, legacy=legacy)
+        yield from (_renamed(mapping, "bbox_head") for mapping in map_backbone_keys(model.network.block_convs))
         return
     levels, voxels = (f"{_VOXELS}.encoder_layers.encoder_layer", "backbone_3d.conv"), (_VOXELS, "backbone_3d")
     renamed = {name.replace(*levels).replace(*voxels): array for name, array in state.items()}
-    yield from (_renamed(link, "rpn_head") for link in pv_rcnn_links(model, renamed, wanted))
+    yield from (_renamed(mapping, "rpn_head") for mapping in pv_rcnn_keys(model, renamed, our_state))
 
 
 def mmdetection3d_name(name: str, head: str = "rpn_head") -> str:
@@ -88,8 +92,8 @@ def mmdetection3d_name(name: str, head: str = "rpn_head") -> str:
     return re.sub(r"^dense_head", head, name)
 
 
-def _renamed(link: Link, head: str) -> Link:
-    return link._replace(source=mmdetection3d_name(link.source, head))
+def _renamed(mapping: KeyMapping, head: str) -> KeyMapping:
+    return mapping._replace(source=mmdetection3d_name(mapping.source, head))
 
 
 def _refuse_old_axes(state: Mapping[str, Tensor]) -> None:
