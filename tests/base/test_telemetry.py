@@ -18,10 +18,11 @@ import yaml
 from asca_deploy import sample_scan_path
 from asca_pillars.base.schema import to_dict
 from asca_pillars.base.telemetry import disable_telemetry, onnxruntime_may_report
+from tests.helpers import socket_filter
 from tests.helpers.package_imports import PACKAGES, ROOT, imports
 from tests.helpers.socket_filter import NOT_HERE
 
-FILTER = Path(__file__).parents[1] / "socket_filter.py"
+FILTER = Path(socket_filter.__file__)
 KEPT = ("PATH", "PYTHONPATH", "LD_LIBRARY_PATH", "OPENBLAS_CORETYPE")
 """Of the environment. What tells onnxruntime that it is tested, such as CI, makes it keep still."""
 CACHES = (".cache/numba", ".cache/matplotlib", ".config/matplotlib")
