@@ -39,7 +39,7 @@ class LabeledSplit(Protocol):
 
     @property
     def has_camera(self) -> bool:
-        """Whether objects are labelled only in a camera's field of view."""
+        """True if objects are labelled only in a camera's field of view."""
 
     @property
     def mounting(self) -> Mounting:
@@ -73,7 +73,7 @@ class LabeledSplit(Protocol):
 
     @property
     def one_reflectance_scale(self) -> bool:
-        """Whether `stored_points` have one scale for all scans; otherwise it is decided for each scan."""
+        """True if `stored_points` have one scale for all scans; otherwise it is decided for each scan."""
 
     def stored_points(self, frame_id: str) -> NDArray[np.float32]:
         """Return all points (N, 4) of the file, possibly not finite or with a reflectance outside 0..1."""

@@ -25,7 +25,7 @@ class Model:
         spec: spec of the model, with its own thresholds.
         camera_view: whether it expects only the points in the image.
         about: its source and device, for the report.
-        unlike: the first warning of each scan that is unlike the training scans.
+        input_warnings: the first warning of each scan that is unlike the training scans.
     """
 
     name: str

@@ -97,7 +97,7 @@ def write_report(
         name: name of the files, see REPORTS.
         page: contents of the Markdown file.
         content: contents of the JSON file.
-        out: output folder of the evaluation, see `claim`.
+        out: output folder of the evaluation, see `check_output_folder`.
         json_path: None for no other copy.
         scored: evaluated predictions; those of an earlier evaluation in `out` are removed.
 

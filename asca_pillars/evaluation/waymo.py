@@ -381,7 +381,7 @@ class WaymoReport:
     frames: ScoredFrames
     scores: Sequence[WaymoScore]
     has_points: bool
-    """Whether the levels come from scans."""
+    """True if the levels come from scans."""
     about: dict[str, Any]
     """Model, command, machine and versions, for the JSON."""
 

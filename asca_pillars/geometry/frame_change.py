@@ -40,7 +40,7 @@ class FrameChange:
 
     @cached_property
     def is_identity(self) -> bool:
-        """Whether points and boxes are unchanged."""
+        """True if points and boxes are unchanged."""
         return bool(np.array_equal(self.axes, np.eye(3)) and not self.shift_m.any())
 
     def points(self, points: NDArray[Any]) -> NDArray[np.float32]:

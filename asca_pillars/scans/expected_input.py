@@ -20,7 +20,7 @@ class ExpectedInput(Strict):
     """Height of the ground near the sensor, LiDAR frame, metres (minus the sensor's height); None if no scan
     showed the ground."""
     camera_view: bool
-    """Whether the scans were cropped to the points in the camera's image."""
+    """True if the scans were cropped to the points in the camera's image."""
 
     def __post_init__(self) -> None:
         for name, low, high in (

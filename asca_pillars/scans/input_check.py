@@ -50,7 +50,7 @@ def check_input(
         counts: points inside and outside the detector's grid.
         expected: statistics of the training scans.
         mounting: the mounting by which the points came into that frame.
-        looks_in: the detector's ranges; None: every direction.
+        model_ranges: the detector's ranges; None: every direction.
     """
     mounting = mounting or Mounting()
     fewest, most = expected.points_per_scan

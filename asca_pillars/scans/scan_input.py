@@ -14,7 +14,7 @@ class ScanInput:
 
     Attributes:
         mounting: mounting of the sensor.
-        said: sentences for the user about what was decided.
+        notes: sentences for the user about the settings that were chosen.
 
     Raises:
         ConfigError, ScanError: an option cannot be used, or the height cannot be estimated.

@@ -161,8 +161,9 @@ def inspect_scans(
         why = f": {reason}" if (reason := next(iter(error_texts), damage)) else ""
         raise ScanError(f"{path}: none of the {source.to_read} scans{of_topic} can be read{why}")
     found = [*source.notes, *([doubt] if doubt else []), *repairs_of(measured.notes)]
-    if recorded:
-        found += _odd_times(times)
+    scan_times = _scan_times(times) if recorded else None
+    if scan_times is not None:
+        found += _odd_times(scan_times, [stamp for _, stamp in times])
     if len(frame_ids) > 1:
         found.append(f"the scans are in {len(frame_ids)} frames: {', '.join(frame_ids)[:200]}")
     problems = [f"{_count(len(error_texts), 'scan')} cannot be read: {error_texts[0]}"] if error_texts else []
@@ -175,7 +176,7 @@ def inspect_scans(
         topic=recorded.topic.name if recorded else None,
         fields=fields,
         frame_ids=tuple(filter(None, frame_ids)),
-        times=_scan_times(times) if recorded else None,
+        times=scan_times,
         scans=len(times) + len(error_texts) if recorded else source.total,
         inspected=len(measured.points),
         points=spread(np.array(measured.points)),
@@ -307,10 +308,10 @@ def _scan_times(times: Sequence[tuple[int, int]]) -> ScanTimes:
     return ScanTimes(seconds, 1 / usual_s, len(gaps), missing, float(steps[longest]), int(numbers[longest]))
 
 
-def _odd_times(times: Sequence[tuple[int, int]]) -> list[str]:
-    """Sentences about stamps that go back or jump, and about gaps."""
-    notes = [notes] if (notes := timestamp_note([stamp for _, stamp in times])) else []
-    found = _scan_times(times)
+def _odd_times(found: ScanTimes, stamps: Sequence[int]) -> list[str]:
+    """Return sentences about stamps that go back or jump, and about gaps."""
+    note = timestamp_note(stamps)
+    notes = [note] if note else []
     if found.gaps:
         notes.append(
             f"{_count(found.gaps, 'gap')} in the time stamps, the longest of {found.longest_gap_s:.3g} s after scan "

@@ -176,7 +176,7 @@ class BoxSplit:
 
     @property
     def has_camera(self) -> bool:
-        """Whether objects are labelled only within an angle ahead."""
+        """True if objects are labelled only within an angle ahead."""
         return self.settings.labeled_view_deg < ALL_AROUND_DEG
 
     @cached_property

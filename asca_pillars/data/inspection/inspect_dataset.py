@@ -146,7 +146,7 @@ class Inspection:
 
     @property
     def sampled(self) -> bool:
-        """Whether frames of the split were left out."""
+        """True if frames of the split were left out."""
         return self.frames + len(self.damaged) < self.frames_in_split
 
 

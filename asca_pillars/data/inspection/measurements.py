@@ -32,7 +32,7 @@ class InputCells:
 
     Attributes:
         name: name of one cell.
-        of_points: finite points (N, >=3), metres, LiDAR frame -> flat index of each one's cell (N,), -1 outside.
+        indices_of: finite points (N, >=3), metres, LiDAR frame -> flat index of each one's cell (N,), -1 outside.
         max_points: points of a cell that the network uses.
         max_points_key: key of `max_points` in the configuration.
         max_cells: limit of cells in a scan; None without one.

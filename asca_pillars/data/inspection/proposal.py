@@ -144,7 +144,7 @@ def _with_ranges_holding(spec: InspectedSpec, boxes: Floats) -> InspectedSpec:
 
 
 def _symmetric(span_m: tuple[float, float], centers: Floats, outside: float, step_m: float) -> tuple[float, float]:
-    """Return a range as `_widened`, symmetric ahead and behind."""
+    """Return a range as `_widened_range`, symmetric ahead and behind."""
     if span_m[0] == -span_m[1] and _widened_range(span_m, centers, outside, step_m) == span_m:
         half = math.ceil(round(2 * span_m[1] / step_m, 6)) * step_m / 2  # whole steps, which may have changed
         return -half, half

@@ -47,7 +47,7 @@ class KittiObject:
 
     @property
     def has_box_3d(self) -> bool:
-        """Whether there is a 3D box: not for DontCare areas and 2D detections, whose sizes are -1."""
+        """True if there is a 3D box: not for DontCare areas and 2D detections, whose sizes are -1."""
         return self.type != "DontCare" and min(self.height_m, self.width_m, self.length_m) > 0
 
 

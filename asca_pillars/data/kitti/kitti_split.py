@@ -51,7 +51,7 @@ class KittiSplit:
 
     @cached_property
     def has_camera(self) -> bool:
-        """Whether only the camera's view is labelled: always except in frames of `asca simulate --view around`.
+        """True if only the camera's view is labelled: always except in frames of `asca simulate --view around`.
 
         Raises:
             DatasetError: the file of the simulation's settings is damaged.

@@ -49,8 +49,8 @@ class BoxPairs:
         frames: (N,) number of each detection's frame.
         objects: (K, 7).
         first: (N,) the first object of the detection's frame, and
-        closeness: closeness of each object of the frame, from the first one on.
-        excuse: (N,) closeness of the closest object that is not counted; -inf without one.
+        similarity: similarity of each object of the frame, from the first one on.
+        ignored_similarity: (N,) similarity of the closest object that is not counted; -inf without one.
     """
 
     scores: Floats

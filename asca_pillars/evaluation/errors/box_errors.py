@@ -121,7 +121,7 @@ class DetectionMatch:
 
     @property
     def is_false(self) -> bool:
-        """Whether it is a reported false positive."""
+        """True if it is a reported false positive."""
         return self.reported and self.kind in FALSE_KINDS
 
 

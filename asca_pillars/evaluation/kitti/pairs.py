@@ -72,7 +72,7 @@ def overlapping_pairs(
     """Return the pairs whose boxes overlap by more than `above` in the image, in bird's-eye view or in 3D.
 
     Args:
-        wanted: (N,) mask of the ground truth to pair.
+        truth_mask: (N,) mask of the ground truth to pair.
         reporter: for the progress.
     """
     truth_boxes, detection_boxes = _upright_boxes(frames.truth), _upright_boxes(frames.detections)

@@ -49,14 +49,14 @@ class NearestImages:
 
     Args:
         recording: to read from.
-        wanted: the topic's name; None: the first one with images.
+        topic_name: the topic's name; None: the first one with images.
 
     Attributes:
         topic: the topic read; None: the recording has no images.
         others: all topics with images, where the first of several was chosen.
-        shown: number of images returned.
+        images_given: number of images returned.
         unreadable: number of images that could not be read.
-        trouble: error of the first of these.
+        error_text: error of the first of these.
 
     Raises:
         ScanError: there are no images on a topic of that name.

@@ -170,7 +170,7 @@ class Row:
 
     @property
     def within(self) -> bool | None:
-        """Whether the value is within the tolerance; None without one."""
+        """True if the value is within the tolerance; None without one."""
         if self.bar is None:
             return None
         return self.value < self.bar if self.measure == "distance" else self.away <= self.bar
@@ -182,7 +182,7 @@ class Row:
 
     @property
     def within_noise(self) -> bool:
-        """Whether the tolerance is exceeded by no more than the noise of the real data."""
+        """True if the tolerance is exceeded by no more than the noise of the real data."""
         return self.within is False and self.noise is not None and self.away <= self.noise
 
 

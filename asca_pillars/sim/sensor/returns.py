@@ -103,9 +103,9 @@ def echo_of(
 ) -> Echo:
     """Return the echo of firing (k, j), which may straddle an edge to a neighboring firing's surface.
 
-    rho in metres, cosine and reflectance are (K, C), as in `Met`; stretch, slopes (K,) and number (C,) as in `Lasers`.
-    `lean` in 0..1 selects the neighbor and the part on it, `fate` in 0..1 the result of two echoes: none, one between
-    both, or the stronger of them.
+    rho in metres, cosine and reflectance are (K, C), as in `FirstHits`; stretch, slopes (K,) and number (C,) as in
+    `Lasers`. `lean` in 0..1 selects the neighbor and the part on it, `fate` in 0..1 the result of two echoes: none, one
+    between both, or the stronger of them.
     """
     columns, turn = rho.shape[1], receiver.columns_per_turn
     slant = rho[k, j] * stretch[k]
