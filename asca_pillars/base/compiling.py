@@ -96,7 +96,12 @@ class _CheckedFile(IndexDataCacheFile):
     """Index and data of a cached function, each followed by a digest, which numba ignores."""
 
     def _load_index(self) -> Any:
-        return super()._load_index() if _is_whole(Path(self._index_path)) else {}
+        if not _is_whole(Path(self._index_path)):
+            return {}
+        try:
+            return super()._load_index()
+        except (AttributeError, ImportError):  # written by an earlier version, for a class that is gone
+            return {}
 
     def _load_data(self, name: str) -> Any:
         path = Path(self._data_path(name))

@@ -3,6 +3,7 @@
 import errno
 import logging
 import os
+import sys
 from collections.abc import Callable
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
@@ -115,3 +116,28 @@ def test_compiled_without_a_cache_where_none_can_be_written(monkeypatch: pytest.
     monkeypatch.setattr(compiling, "_CheckedCache", nowhere)
     double = compiling.compiled(numba.types.int64)(lambda number: 2 * number)
     assert double(21) == 42
+
+
+def test_a_cache_for_a_class_that_is_gone_is_made_anew(source: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As after an update that gave the class of an argument another name: numba's index holds the old one."""
+    text = """
+from typing import NamedTuple
+from asca_pillars.base.compiling import cached
+
+class Earlier(NamedTuple):
+    value: int
+
+Pair = Earlier
+
+@cached()
+def value_of(pair):
+    return pair.value
+"""
+    for written in (text, text.replace("Earlier", "Renamed")):
+        source.write_text(written)
+        spec = spec_from_file_location("made_up_kernels", source)
+        assert spec is not None and spec.loader is not None
+        module = module_from_spec(spec)
+        monkeypatch.setitem(sys.modules, "made_up_kernels", module)
+        spec.loader.exec_module(module)
+        assert module.value_of(module.Pair(3)) == 3
