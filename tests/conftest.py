@@ -4,16 +4,19 @@ import contextlib
 import copy
 import functools
 import gc
+import importlib
 import logging
 import os
 import sys
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
+from filelock import FileLock
 from hypothesis import settings
 
-import asca_pillars  # noqa: F401  (before a test imports onnxruntime: it refuses that one's reports)
+import asca_pillars
 
 # How long an example takes depends on what else the machine does, and says nothing about whether it is right.
 settings.register_profile("untimed", deadline=None)
@@ -24,6 +27,20 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 # What is imported stays to the end. Looking through it for garbage again and again took an eighth of the suite's time.
 gc.disable()
+
+
+def pytest_sessionstart(session: pytest.Session) -> None:
+    """Divide the compiling of kernels among pytest's processes: each would compile all, which takes 20 s."""
+    worker = getattr(session.config, "workerinput", None)
+    if worker is None:
+        return
+    package = Path(asca_pillars.__file__).parent
+    kernels = sorted(path.relative_to(package.parent) for path in package.glob("*/**/*kernels.py"))
+    first = int(worker["workerid"].removeprefix("gw")) * len(kernels) // worker["workercount"]
+    for path in kernels[first:] + kernels[:first]:
+        module = ".".join(path.with_suffix("").parts)
+        with FileLock(Path(session.config.option.basetemp).parent / f"{module}.lock"):
+            importlib.import_module(module)
 
 
 def pytest_collection_finish() -> None:
