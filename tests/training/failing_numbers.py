@@ -25,7 +25,7 @@ class Numbers:
         if index == 4 and self.what == "unsendable":
             return Unsendable()
         if self.what == "slow":
-            time.sleep(3 if index == 4 else 0)
+            time.sleep(1 if index == 4 else 0)
         elif index == 4 and self.what:
             os.kill(os.getpid(), getattr(signal, self.what))
         return index
