@@ -61,7 +61,7 @@ def _runtime_log() -> Iterator[None]:
 
 @pytest.fixture(scope="session", autouse=True)
 def _onnx_makes_nothing_twice(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """torch.onnx reads the source of its thousand operators anew for each graph: half of a small network's export.
+    """torch.onnx reads and registers its thousand operators anew for each graph: half of a small network's export.
 
     Networks that several tests export are exported for the first of them.
     """
@@ -71,12 +71,13 @@ def _onnx_makes_nothing_twice(tmp_path_factory: pytest.TempPathFactory) -> Itera
     from tests.helpers.kept_exports import exports_kept
 
     with pytest.MonkeyPatch.context() as patch, exports_kept(tmp_path_factory):
-        with contextlib.suppress(ImportError):  # a torch that has it elsewhere: exports only take longer
+        with contextlib.suppress(ImportError, AttributeError):  # a torch that has it elsewhere: exports take longer
             _keep_registry(patch)
         yield
 
 
 def _keep_registry(patch: pytest.MonkeyPatch) -> None:
+    import torch._export.utils as exporting
     from torch.onnx._internal.exporter._registration import ONNXRegistry
 
     read = functools.cache(ONNXRegistry.from_torchlib)
@@ -87,3 +88,4 @@ def _keep_registry(patch: pytest.MonkeyPatch) -> None:
         return registry
 
     patch.setattr(ONNXRegistry, "from_torchlib", staticmethod(from_torchlib))
+    patch.setattr(exporting, "_materialize_cpp_cia_ops", functools.cache(exporting._materialize_cpp_cia_ops))
