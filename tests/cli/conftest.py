@@ -11,6 +11,18 @@ from tests.helpers.scenes import write_dataset
 
 
 @pytest.fixture
+def drawn_plots() -> None:
+    """Of tests that look at a plot."""
+
+
+@pytest.fixture(autouse=True)
+def _blank_plots(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Plots are files with nothing on them: to draw one takes a second, and is tested where they are made."""
+    if "drawn_plots" not in request.fixturenames:
+        monkeypatch.setattr("matplotlib.figure.Figure.draw", lambda figure, renderer: None)
+
+
+@pytest.fixture
 def root(tmp_path: Path) -> Path:
     return write_dataset(tmp_path / "kitti", 3, val_frames=2)
 

@@ -20,12 +20,7 @@ def written(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
 
 
-@pytest.fixture
-def blank_plots(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Pictures are files of the same kind with nothing on them: to draw one takes seconds."""
-    monkeypatch.setattr("matplotlib.figure.Figure.draw", lambda figure, renderer: None)
-
-
+@pytest.mark.usefixtures("drawn_plots")
 def test_frames_are_simulated_and_compared(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     simulate(tmp_path, 2)
     told = capsys.readouterr().out
@@ -38,7 +33,6 @@ def test_frames_are_simulated_and_compared(tmp_path: Path, capsys: pytest.Captur
     assert written(tmp_path) == before
 
 
-@pytest.mark.usefixtures("blank_plots")
 def test_scans_that_were_not_simulated_are_compared_and_never_added_to(tmp_path: Path) -> None:
     before = written(write_set(tmp_path))
     simulate(tmp_path, None)
@@ -56,6 +50,7 @@ def test_plots_need_matplotlib_and_say_so_before_the_work(tmp_path: Path, monkey
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.usefixtures("drawn_plots")
 def test_objects_are_compared_with_those_of_a_real_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     real = write_set(tmp_path / "real")
     simulate(tmp_path / "sim", 24, report=False)
@@ -125,7 +120,6 @@ def test_a_file_of_somebody_else_under_a_frame_s_name_is_kept(tmp_path: Path, na
     assert theirs.read_text().startswith("Car 0 0 0 1")
 
 
-@pytest.mark.usefixtures("blank_plots")
 def test_a_report_of_somebody_else_is_not_replaced(tmp_path: Path) -> None:
     root = write_set(tmp_path / "set")
     report = root / "report"
@@ -141,7 +135,6 @@ def test_a_report_of_somebody_else_is_not_replaced(tmp_path: Path) -> None:
         simulate(root, None)
 
 
-@pytest.mark.usefixtures("blank_plots")
 def test_nothing_is_simulated_through_links(tmp_path: Path) -> None:
     simulate(tmp_path / "simulated", 2)
     for name in ("training/velodyne", "training", "ImageSets", "ImageSets/val.txt", "simulation.json", "report"):
