@@ -47,6 +47,7 @@ def test_every_block_runs(name: str, files: Path, tmp_path: Path, monkeypatch: p
     for folder in MADE_HERE.get(name, ()):
         shutil.rmtree(tmp_path / folder)
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("matplotlib.figure.Figure.draw", lambda figure, renderer: None)  # a second each
     logging.getLogger("asca_pillars").setLevel(logging.ERROR)
     for block in runs(name):
         run(block, name)
