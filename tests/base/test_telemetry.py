@@ -19,6 +19,7 @@ from asca_deploy import sample_scan_path
 from asca_pillars.base.schema import to_dict
 from asca_pillars.base.telemetry import disable_telemetry, onnxruntime_may_report
 from tests.helpers import socket_filter
+from tests.helpers.bundles import DENSE_INT8
 from tests.helpers.package_imports import PACKAGES, ROOT, imports
 from tests.helpers.socket_filter import NOT_HERE
 
@@ -158,7 +159,7 @@ ASCA = (sys.executable, "-c", "import sys; sys.argv[0] = 'asca'; from asca_pilla
 DETECT = """
 import sys, time
 from asca_pillars import Detector, read_scan
-print(len(Detector("asca_small_sim_int8")(read_scan(sys.argv[1]).points)))
+print(len(Detector("fast")(read_scan(sys.argv[1]).points)))
 time.sleep(float(sys.argv[2]))
 """
 REPORT_S = 12.0
@@ -183,7 +184,7 @@ def test_reports_would_be_seen(fresh: Fresh) -> None:
     ("command", "results"),
     [
         (("detect", "-o", "out"), "work/out/"),
-        (("detect", "-o", "out", "-b", "asca_small_sim_int8", "--provider", "openvino"), "work/out/"),
+        (("detect", "-o", "out", "-b", DENSE_INT8, "--provider", "openvino"), "work/out/"),
         (("bench", "--rounds", "1", "--json", "out.json"), "work/out.json"),
         (("doctor",), "work/nothing"),
     ],
