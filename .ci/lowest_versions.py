@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).resolve().parent.parent
+DENSE_INT8 = str(ROOT / "tests" / "bundles" / "dense_int8")
 EXTRAS = ("train", "sim", "eval", "import", "recordings", "openvino")
 """Those that can be installed together in their lowest versions: rerun-sdk of `view` needs NumPy 2."""
 _REQUIREMENT = re.compile(r"(?P<name>[\w.-]+)(?:\[(?P<extras>[\w,-]+)\])?(?P<bounds>[^;]*)")
@@ -32,7 +33,7 @@ WITHOUT_TORCH = (
     ("asca", "simulate", "data", "--frames", "10", "--view", "camera", "--val-share", "0.2", "--seed", "1"),
     ("asca", "inspect", "data", "-c", "asca_small_sparse_sim"),
     ("asca", "detect", "data/training/velodyne", "--out", "detections"),
-    ("asca", "bench", "data/training/velodyne", "-b", "asca_small_sparse_sim"),
+    ("asca", "bench", "data/training/velodyne", "-b", "fast"),
 )
 BY_EXTRA = {
     "train": (
@@ -56,7 +57,7 @@ BY_EXTRA = {
         ("asca", "detect", "drive", "--out", "rosbag2"),
         ("asca", "detect", "drive.bag", "--out", "rosbag"),
     ),
-    "openvino": (("asca", "detect", "-b", "asca_small_sim_int8", "--provider", "openvino", "--out", "openvino"),),
+    "openvino": (("asca", "detect", "-b", DENSE_INT8, "--provider", "openvino", "--out", "openvino"),),
 }
 """What needs an extra; `made_files` makes what they read."""
 

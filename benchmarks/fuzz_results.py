@@ -214,7 +214,7 @@ def read_boxes(path: Path) -> Any:
 
 def _page(folder: Path) -> Kind:
     """Return the kind of a foreign bundle.json, from which a page is made."""
-    source, bundle, package = shipped_bundles()["asca_small_sim_int8"], folder / "bundle", folder / "onnxruntime-web"
+    source, bundle, package = shipped_bundles()["default"], folder / "bundle", folder / "onnxruntime-web"
     bundle.mkdir()
     for name in ("encoder.onnx", "backbone.onnx", "main.js", "index.html", "x.mjs"):  # names in a foreign bundle
         graph = "encoder" if name == "encoder.onnx" else "backbone"

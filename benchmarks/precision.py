@@ -42,8 +42,8 @@ ROWS = (
 
 def main(
     scans: Annotated[Path | None, typer.Argument(help="A scan or a folder of them. Default: the sample.")] = None,
-    reference: Annotated[str, typer.Option(help="Float32 bundle: a folder or one that ships.")] = "asca_small_sim",
-    int8: Annotated[str, typer.Option(help="The 8-bit one made from it.")] = "asca_small_sim_int8",
+    reference: Annotated[str, typer.Option(help="Float32 bundle: a folder or one that ships.")] = "default_float32",
+    int8: Annotated[str, typer.Option(help="The 8-bit one made from it.")] = "default",
 ) -> None:
     """Print one row for each way to run the network with fewer digits."""
     console = Console(markup=False)

@@ -7,7 +7,8 @@
 
 or, for PV-RCNN, of an exported bundle:
 
-    python -m benchmarks.refine_gain pvrcnn_small_sim data/check
+    asca export pvrcnn_small_sim -o pvrcnn
+    python -m benchmarks.refine_gain pvrcnn data/check
 
 All rows use the same proposals and the same suppression.
 """

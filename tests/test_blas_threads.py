@@ -40,15 +40,17 @@ while last != worked_ms():  # until they sleep
 """
 
 RUNTIME = """
+from pathlib import Path
 from asca_deploy.tracker import Tracker
 from asca_pillars import Detector, Mounting, read_scan
 from asca_deploy import sample_scan_path
+from tests.helpers.bundles import DENSE_INT8, PV_RCNN
 from asca_pillars.scans.ground_height import estimate_height
 
 points = read_scan(sample_scan_path()).points
 cos, sin = np.cos(0.05), np.sin(0.05)
 pose = ((cos, 0, sin, 0), (0, 1, 0, 0.1), (-sin, 0, cos, 0), (0, 0, 0, 1))
-for bundle in ("asca_sim_int8", "asca_refine_sim_int8", "asca_small_sim_int8"):
+for bundle in ("default", "accurate", DENSE_INT8):
     for name, options in {
         "plain": {},
         "height": {"mounting": Mounting(sensor_height_m=1.9)},
@@ -56,9 +58,9 @@ for bundle in ("asca_sim_int8", "asca_refine_sim_int8", "asca_small_sim_int8"):
         "around": {"view": "around"},
     }.items():
         detector = Detector(bundle, **options)
-        step(f"{bundle} {name}", lambda: detector(points))
+        step(f"{Path(bundle).name} {name}", lambda: detector(points))
 step("stream", lambda: list(Detector(mounting=Mounting(axes="y-forward")).stream([points, points])))
-step("pv_rcnn", lambda: Detector("pvrcnn_small_sim", mounting=Mounting(sensor_height_m=1.9))(points))
+step("pv_rcnn", lambda: Detector(PV_RCNN, mounting=Mounting(sensor_height_m=1.9))(points))
 step("sensor height", lambda: estimate_height([points], Mounting(pose=pose)))
 found = Detector(view="around")(points)
 step("tracker", lambda: [Tracker()(found, 0.1 * scan, np.array(pose)) for scan in range(3)])

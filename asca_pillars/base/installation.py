@@ -5,6 +5,12 @@ import shlex
 from pathlib import Path
 
 _PROJECT = 'name = "asca-pillars"'
+_FORMER_NAMES = {
+    "asca_sim_int8": "default",
+    "asca_sim": "default_float32",
+    "asca_small_sparse_sim_int8": "fast",
+    "asca_refine_sim_int8": "accurate",
+}
 
 
 def source_tree() -> Path | None:
@@ -35,8 +41,13 @@ def upgrade_advice() -> str:
     return "install a newer asca-pillars" if root is None else f"upgrade with `git -C {shlex.quote(str(root))} pull`"
 
 
-def shipped_bundles() -> dict[str, Path]:
-    """Return the folders of the bundles that come with the runtime, by name; the runtime is not imported."""
+def shipped_models() -> dict[str, Path]:
+    """Return the folders of bundles and weights that come with the runtime, by name; the runtime is not imported."""
     runtime = importlib.util.find_spec("asca_deploy")
     places = [] if runtime is None else runtime.submodule_search_locations or []
-    return {path.parent.name: path.parent for place in places for path in Path(place).glob("bundles/*/bundle.json")}
+    return {path.name: path for place in places for path in sorted(Path(place).glob("bundles/*")) if path.is_dir()}
+
+
+def find_shipped(name: str) -> Path | None:
+    """Return the folder of a model that ships, by its name or one that it had before; None if there is none."""
+    return shipped_models().get(_FORMER_NAMES.get(name, name))

@@ -120,7 +120,7 @@ def bench(
     machine's measured matrix multiplications per second that the backbone reaches. Of more than 100 scans some are
     timed, evenly spaced; of a recording the first 100 with points.
 
-    Example: asca bench my_scans/ --matrix --compare asca_small_sim
+    Example: asca bench my_scans/ --matrix --compare fast
     """
     import logging
     import os

@@ -17,9 +17,7 @@ from asca_pillars.cli.options import (
 def evaluate(
     model: Annotated[
         Path | None,
-        typer.Argument(
-            help="Bundle (folder, or name of one that ships) or checkpoint (.ckpt). Default: asca_sim_int8."
-        ),
+        typer.Argument(help="Bundle (folder, or name of one that ships) or checkpoint (.ckpt). Default: default."),
     ] = None,
     *,
     data: Annotated[

@@ -18,7 +18,7 @@ def export(
     checkpoint: Annotated[
         Path,
         typer.Argument(
-            help="RUN/checkpoints/best.ckpt or last.ckpt, or a bundle that holds its weights, such as asca_sim; with "
+            help="RUN/checkpoints/best.ckpt or last.ckpt, or a bundle that holds its weights, such as default; with "
             "--golden or --browser any bundle."
         ),
     ],
@@ -120,9 +120,9 @@ def export(
 
     asca export runs/small/checkpoints/last.ckpt -o my_bundle --score Car=0.4
 
-    asca export asca_sim --dense-neck -o asca_sim_dense
+    asca export default --dense-neck -o dense
 
-    asca export asca_sim --range 0 51.2 -25.6 25.6 -o asca_sim_near
+    asca export default --range 0 51.2 -25.6 25.6 -o near
 
     asca export my_bundle --golden -o golden
     """

@@ -8,6 +8,7 @@ import typer
 
 from asca_pillars import __version__
 from asca_pillars.cli.ablate import ablate
+from asca_pillars.cli.average_weights import average_weights
 from asca_pillars.cli.bench import bench
 from asca_pillars.cli.bundle import app as bundle
 from asca_pillars.cli.detect import detect
@@ -48,6 +49,7 @@ _add(prepare)
 _add(train)
 _add(evaluate, "eval")
 _add(export)
+_add(average_weights, "average-weights")
 _add(import_weights, "import-weights")
 app.add_typer(bundle, name="bundle")
 _add(ablate)

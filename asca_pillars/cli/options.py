@@ -27,9 +27,8 @@ BundleOption = Annotated[
     typer.Option(
         "--bundle",
         "-b",
-        help="Model bundle: a folder, or the name of one that comes with asca: asca_sim, asca_small_sparse_sim (half "
-        "as wide: faster), asca_refine_sim (asca_sim and a second stage) or asca_small_sim (a dense neck, for "
-        "providers that need one), each also with _int8, and pvrcnn_small_sim (PV-RCNN). Default: asca_sim_int8.",
+        help="Model bundle: a folder, or the name of one that comes with asca: default, fast (half as wide), accurate "
+        "(with a second stage), all in 8 bits, or default_float32. Default: default.",
         rich_help_panel="Input",
     ),
 ]

@@ -75,7 +75,7 @@ class RefineModel(Strict):
     """
 
     kind: Literal["pillar_refine"] = "pillar_refine"
-    first_stage: str = "asca_sim"
+    first_stage: str = "default_float32"
     first_stage_identity: str = ""
     bev_channels: int = 0
     spec: PillarSpec = field(default_factory=PillarSpec)

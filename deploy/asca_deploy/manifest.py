@@ -13,7 +13,6 @@ from typing import Any
 from asca_deploy.bundle import (
     MANIFEST,
     PILLAR_GRAPHS,
-    SCHEMA_VERSION,
     Bundle,
     GraphFile,
     PillarBundle,
@@ -32,7 +31,6 @@ ESSENTIALS = ("schema_version", "kind", "name", "license", "precision", "spec", 
 """Keys of bundle.json that are stamped into every graph's metadata, each as JSON."""
 
 _ESSENTIALS_OF = {"pillar_refine": (*ESSENTIALS, "refine"), "pv_rcnn": (*ESSENTIALS[:-1], "pv_rcnn")}
-_ESSENTIALS_2 = ("license", "spec", "cpa", "layout")  # schema 2, whose 8-bit graphs had the name of the float bundle
 # Defaults of keys that older bundles lack, in these sections and in a pillar detector's `spec` and `spec.grid`: bundles
 # from before sparse necks, scores of both stages, other direction bins and anchors, and pooled maps. A removed key is
 # detected by the graphs' metadata.
@@ -55,7 +53,7 @@ def load_pillar_bundle(folder: str | Path) -> PillarBundle:
     bundle = load_bundle(folder)
     if not isinstance(bundle, PillarBundle):
         raise BundleError(
-            f"{folder}: a bundle of kind {bundle.kind}, where one of a pillar detector is needed, such as asca_sim"
+            f"{folder}: a bundle of kind {bundle.kind}, where one of a pillar detector is needed, such as default"
         )
     return bundle
 
@@ -70,10 +68,7 @@ def load_bundle(folder: str | Path) -> Bundle:
     folder = Path(folder)
     manifest = folder / MANIFEST
     data = read_manifest(manifest)
-    old = data["schema_version"] == 2
-    stamped = {key: data.get(key) for key in (_ESSENTIALS_2 if old else _stamped_keys(data))}
-    if old:
-        data = upgrade_schema_2(data)
+    stamped = {key: data.get(key) for key in _stamped_keys(data)}
     data |= {name: first | data[name] for name, first in _LATER_KEYS.items() if isinstance(data.get(name), dict)}
     family: type[Bundle] = PvRcnnBundle if data.get("kind") == "pv_rcnn" else PillarBundle
     layout = _pop_layout(manifest, data) if family is PillarBundle else None
@@ -114,27 +109,6 @@ def _pop_layout(manifest: Path, data: dict[str, Any]) -> Any:
     if isinstance(spec := data.get("spec"), dict) and isinstance(grid := spec.get("grid"), dict):
         data["spec"] = _LATER_SPEC_KEYS | spec | {"grid": _LATER_GRID_KEYS | grid}
     return layout
-
-
-def upgrade_schema_2(data: dict[str, Any]) -> dict[str, Any]:
-    """Convert the manifest of a bundle of schema 2 to schema 3; invalid values stay.
-
-    Schema 2 knew pillar detectors alone, measured the expected input on the scans given to the export, and did not
-    say whether the model was trained on the camera's view; `asca eval` took it for granted.
-    """
-    data = dict(data)
-    pillar = {key: data.pop(key) for key in ("cpa", "channels", "canvas", "layout") if key in data}
-    if isinstance(expected := data.get("expected_input"), dict):
-        data["expected_input"] = {**expected, "camera_view": True}
-    if isinstance(quantization := data.get("quantization"), dict):
-        data["quantization"] = {**quantization, "dropped_scans": None}
-    return {
-        **data,
-        "schema_version": SCHEMA_VERSION,
-        "kind": "pillar",
-        "pillar": pillar,
-        "expected_input_from": "export",
-    }
 
 
 def write_bundle_manifest(folder: str | Path, bundle: Bundle) -> None:

@@ -45,7 +45,7 @@ def read_manifest(manifest: Path) -> dict[str, Any]:
             f"{manifest}: schema_version {reprlib.repr(version)} is newer than {SCHEMA_VERSION}, which this version "
             f"reads; {upgrade_advice()}"
         )
-    if version < 2:
+    if version < SCHEMA_VERSION:
         raise BundleError(f"{manifest}: schema_version {reprlib.repr(version)} is no longer read; {EXPORT_AGAIN}")
     return dict(data)
 

@@ -11,17 +11,17 @@ from asca_deploy.manifest_file import refuse_run_folder
 from asca_pillars.base.errors import BundleError
 from asca_pillars.base.files import WEIGHTS_FILE
 from asca_pillars.base.input_files import require_content
+from asca_pillars.base.installation import find_shipped, shipped_models
 
 
 def default_bundle_path() -> Path:
-    """Return the folder of the default model: 8-bit, the faster one on every CPU."""
-    return shipped_bundles()["asca_sim_int8"]
+    """Return the folder of the default model: in 8 bits, which are faster than float32 on every CPU."""
+    return shipped_bundles()["default"]
 
 
 def shipped_bundles() -> dict[str, Path]:
     """Return the folders of the models that come with the package, by name."""
-    folders = Path(str(resources.files("asca_deploy") / "bundles")).iterdir()
-    return {folder.name: folder for folder in sorted(folders) if (folder / MANIFEST).is_file()}
+    return {name: folder for name, folder in shipped_models().items() if (folder / MANIFEST).is_file()}
 
 
 def find_bundle(bundle: str | Path | None) -> Path:
@@ -34,27 +34,36 @@ def find_bundle(bundle: str | Path | None) -> Path:
         return default_bundle_path()
     if Path(bundle).exists():
         return Path(bundle)
-    shipped = shipped_bundles()
-    if str(bundle) not in shipped:
+    folder = find_shipped(str(bundle))
+    if folder is None:
         raise BundleError(
-            f"{bundle}: no such folder, and no bundle of that name ships, only {', '.join(shipped)};"
+            f"{bundle}: no such folder, and no bundle of that name ships, only {', '.join(shipped_bundles())};"
             " make one with `asca export`"
         )
-    return shipped[str(bundle)]
+    if not (folder / MANIFEST).is_file():
+        raise BundleError(
+            f"{bundle}: of this model only its weights ship; make a bundle with `asca export {bundle} -o {bundle}`"
+        )
+    return folder
 
 
 def find_weights(bundle: str | Path) -> Path:
     """Return the checkpoint that a bundle (folder, or name of one that ships) holds beside its graphs.
 
+    Those of a model that ships in 8 bits lie beside its float32 form: `default` has those of `default_float32`.
+
     Raises:
         BundleError: there is no such bundle, it is damaged, it holds none, or another one than it was exported with.
     """
-    folder = find_bundle(bundle)
+    shipped = None if Path(bundle).exists() else find_shipped(str(bundle))
+    if shipped is not None and not (shipped / WEIGHTS_FILE).is_file():
+        shipped = find_shipped(f"{shipped.name}_float32") or shipped
+    folder = shipped or find_bundle(bundle)
     path = folder / WEIGHTS_FILE
     require_content(path, BundleError)
     if not path.is_file():
         refuse_run_folder(folder)
-        having = [name for name, folder in shipped_bundles().items() if (folder / WEIGHTS_FILE).is_file()]
+        having = [name for name, folder in shipped_models().items() if (folder / WEIGHTS_FILE).is_file()]
         raise BundleError(
             f"{bundle}: holds no {WEIGHTS_FILE}, which `asca export --with-weights` adds to a bundle; of those that "
             f"ship {', '.join(having) or 'none'} has one"

@@ -21,6 +21,7 @@ from asca_deploy import sample_scan_path
 from asca_pillars.base.schema import to_dict
 from asca_pillars.base.telemetry import disable_telemetry, onnxruntime_may_report
 from tests.helpers import socket_filter
+from tests.helpers.bundles import DENSE_INT8
 from tests.helpers.package_imports import PACKAGES, ROOT, imports
 from tests.helpers.socket_filter import NOT_HERE
 
@@ -177,7 +178,7 @@ def asca(*commands: tuple[object, ...]) -> tuple[str, ...]:
 DETECT = """
 import sys, time
 from asca_pillars import Detector, read_scan
-print(len(Detector("asca_small_sim_int8")(read_scan(sys.argv[1]).points)))
+print(len(Detector("fast")(read_scan(sys.argv[1]).points)))
 time.sleep(float(sys.argv[2]))
 """
 REPORT_S = 12.0
@@ -206,7 +207,7 @@ def test_commands_of_the_runtime(fresh: Fresh) -> None:
         ("doctor",),
     ]
     if importlib.util.find_spec("openvino") is not None:
-        commands.append(("detect", "-o", "out/openvino", "-b", "asca_small_sim_int8", "--provider", "openvino"))
+        commands.append(("detect", "-o", "out/openvino", "-b", DENSE_INT8, "--provider", "openvino"))
     (fresh.work / "out").mkdir()
     result = fresh.run(*asca(*commands))
     assert result.returncode == 0, f"{result.stdout}{result.stderr}"

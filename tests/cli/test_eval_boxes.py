@@ -140,7 +140,7 @@ def test_a_model_gets_the_points_that_it_was_trained_on(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, camera_view: bool
 ) -> None:
     root, given = write_dataset(tmp_path / "kitti", 2), []
-    sample = Detector("asca_small_sparse_sim")
+    sample = Detector("fast")
 
     def detect(points: NDArray[np.float32]) -> Detections:
         given.append(len(points))

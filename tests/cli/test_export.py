@@ -98,7 +98,7 @@ def test_what_has_no_masked_form_is_refused_before_scans_are_read(with_weights: 
 def test_what_cannot_be_exported_is_one_line(with_weights: Path, scans: Path, tmp_path: Path) -> None:
     out, tail = tmp_path / "out", ("-o", tmp_path / "out", "--scans", scans)
     for arguments, message in (
-        (("asca_sim_int8", *tail), "asca_sim_int8: holds no weights.ckpt"),
+        (("fast", *tail), "fast: holds no weights.ckpt"),
         ((tmp_path / "nowhere", *tail), "no such folder"),
         ((with_weights, "--dense-neck", "--int8", *tail), "--dense-neck with --int8"),
         ((with_weights, "--golden", "--dense-neck", "-o", out), "--dense-neck is for a checkpoint"),

@@ -10,6 +10,7 @@ import pytest
 import typer
 
 from asca_deploy import Detector, default_bundle_path
+from asca_deploy.manifest import load_bundle
 from asca_pillars.base import errors
 from asca_pillars.cli import doctor_checks
 from asca_pillars.cli.run_command import run_command
@@ -66,7 +67,8 @@ def test_doctor_as_json_says_whether_the_model_runs() -> None:
     done = run_here("doctor", "--json")
     assert done.returncode == 0
     checks = json.loads(done.stdout)
-    assert checks["model"]["ok"] and checks["model"]["made_by"]["model"] == checks["model"]["name"]
+    assert checks["model"]["ok"] and checks["model"]["name"] == "default"
+    assert checks["model"]["made_by"]["model"] == load_bundle(default_bundle_path()).name
     assert checks["providers"]["cpu"] == {"ok": True, "says": "ok"}
     assert set(checks["extras"]["train"]) == {"ok", "says"}
 
@@ -81,18 +83,18 @@ def test_doctor_as_json_says_whether_the_model_runs() -> None:
 
 def test_a_deadline_is_judged(tmp_path: Path) -> None:
     write_scan(tmp_path / "1.bin", np.ones((3, 4), np.float32))
-    command = ("bench", tmp_path / "1.bin", "--rounds", 2, "--bundle", "asca_small_sim_int8", "--deadline")
+    command = ("bench", tmp_path / "1.bin", "--rounds", 2, "--bundle", "fast", "--deadline")
     late = run_here(*command, 0.001, "--late", 0.5, "--json", tmp_path / "report.json")
     assert late.returncode == 1 and "later than 0.001 ms: 100.0% of 2 frames" in late.stdout, late.stderr
     report = json.loads((tmp_path / "report.json").read_text())
-    assert report["late_share"] == 1 and report["made_by"]["model"] == "asca_small_sim_int8"
+    assert report["late_share"] == 1 and report["made_by"]["model"] == "asca_small_sparse_sim_int8"
     total = report["total_ms"]
     assert total["min"] <= total["p50"] <= total["p95"] <= total["p99"] <= total["max"]
     assert run_here(*command, 1e6, "--late", 0).returncode == 0
 
 
 def test_bundles_are_listed_described_and_verified(tmp_path: Path) -> None:
-    assert "asca_sim_int8: pillar, int8, 3.4 MiB, Apache-2.0, the default" in run_here("bundle", "list").stdout
+    assert "default: pillar, int8, 3.4 MiB, Apache-2.0, the default" in run_here("bundle", "list").stdout
     about = json.loads(run_here("bundle", "info", "--json").stdout)
     assert about["weights_sha256"] == Detector().made_by["weights_sha256"]
     folder = shutil.copytree(default_bundle_path(), tmp_path / "bundle")
@@ -106,7 +108,7 @@ def test_bundles_are_listed_described_and_verified(tmp_path: Path) -> None:
 
 def test_warm_up_changes_no_result(caplog: pytest.LogCaptureFixture) -> None:
     points = np.random.default_rng(1).uniform(0, 1, (2000, 4)).astype(np.float32) * [40, 8, 2, 1] - [0, 4, 2, 0]
-    fresh, warm = Detector("asca_small_sim_int8"), Detector("asca_small_sim_int8")
+    fresh, warm = Detector("fast"), Detector("fast")
     assert warm.warm_up(5000) > 0
     assert not caplog.records
     np.testing.assert_array_equal(warm(points).boxes, fresh(points).boxes)

@@ -129,7 +129,7 @@ def test_a_height_is_refused_where_no_scan_shows_the_ground(tmp_path: Path, samp
 
 def test_detect_goes_on_with_a_scan_without_ground(tmp_path: Path, sample: NDArray[np.float32]) -> None:
     folder = write_folder(tmp_path / "sweeps", sample, [True, False])
-    result, lines = detect(tmp_path, folder, "--sensor-height", "auto", "--no-pictures", "-b", "asca_small_sim_int8")
+    result, lines = detect(tmp_path, folder, "--sensor-height", "auto", "--no-pictures", "-b", "fast")
     assert result.exit_code == 0 and len(lines) == 2, "the height is left out, the boxes are not"
     assert "left out: " in result.output and "001.bin" in result.output
 

@@ -72,7 +72,7 @@ def test_a_wrong_real_folder_and_a_bundle_without_one_are_told_before_the_work(t
     with pytest.raises(AscaError, match="asca_smal_sim: no such folder"):
         command.simulate(tmp_path / "sim", frames=2, workers=1, like=real, bundle=Path("asca_smal_sim"))
     with pytest.raises(AscaError, match="give --like"):
-        command.simulate(tmp_path / "sim", frames=2, workers=1, view="camera", bundle=Path("asca_small_sim"))
+        command.simulate(tmp_path / "sim", frames=2, workers=1, view="camera", bundle=Path("fast"))
     assert not (tmp_path / "sim").exists()
 
 

@@ -75,7 +75,7 @@ def test_json_replaces_its_own_report_alone(tiny_bundle: Path, scan: Points, tmp
 
 def test_a_bundle_is_not_compared_with_itself(tiny_bundle: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tiny_bundle.parent)
-    for others in ([tiny_bundle], [Path(tiny_bundle.name), "asca_sim"]):
+    for others in ([tiny_bundle], [Path(tiny_bundle.name), "default_float32"]):
         options = [part for other in others for part in ("--compare", str(other))]
         with pytest.raises(ConfigError, match=f"--compare {others[0]}: a bundle is compared with itself"):
             CliRunner().invoke(app, ["bench", "-b", str(tiny_bundle), *options], catch_exceptions=False)
@@ -120,7 +120,7 @@ def test_a_scan_with_nothing_to_compute_has_no_roofline(tiny_bundle: Path, tmp_p
 
 def test_a_bundle_that_ships_goes_by_its_name(tiny_bundle: Path) -> None:
     with pytest.raises(ConfigError, match="compared with itself"):
-        CliRunner().invoke(app, ["bench", "--compare", "asca_sim_int8"], catch_exceptions=False)
+        CliRunner().invoke(app, ["bench", "--compare", "fast"], catch_exceptions=False)
 
 
 def test_of_many_scans_some_are_timed(

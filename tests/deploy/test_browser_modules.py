@@ -30,6 +30,7 @@ from asca_pillars.scans.scan_reader import read_scan, write_scan
 from benchmarks.fuzz import damaged
 from benchmarks.fuzz_inputs import Kind, read_points, scan_seeds
 from tests.deploy import conftest as tiny
+from tests.helpers.bundles import DENSE_FLOAT32, DENSE_INT8
 from tests.scans import scan_files
 from tests.scans.pcd_cases import CASES
 
@@ -37,7 +38,7 @@ ROOT = Path(__file__).parents[2]
 MODULES = ROOT / "deploy" / "asca_deploy" / "browser"
 SCRIPTS = Path(__file__).parent / "javascript"
 NODE = shutil.which("node")
-MODELS = "asca_small_sim", "asca_small_sim_int8", "asca_small_sparse_sim", "asca_sim_int8"
+MODELS = shipped_bundles()["default_float32"], shipped_bundles()["default"], DENSE_FLOAT32, DENSE_INT8
 
 pytestmark = pytest.mark.skipif(NODE is None, reason="needs node")
 
@@ -59,9 +60,9 @@ def _bytes(value: bytes) -> dict[str, str]:
 
 
 def test_stages_on_the_golden_vectors_of_the_models_that_ship(tmp_path: Path) -> None:
-    for name in MODELS:
-        write_golden(tmp_path / name, shipped_bundles()[name], sample_scan_path())
-        assert_same_stages(tmp_path / name, shipped_bundles()[name])
+    for folder in MODELS:
+        write_golden(tmp_path / folder.name, folder, sample_scan_path())
+        assert_same_stages(tmp_path / folder.name, folder)
 
 
 @pytest.mark.parametrize("neck", ["dense", "sparse"])
@@ -212,9 +213,9 @@ def test_as_many_passes_or_as_wide_ranges_as_python_takes(camera_view: bool) -> 
         expected = turns_around(Ranges(x, y, (-3.0, 1.0)), camera_view=camera_view)
         np.testing.assert_allclose([turn["axes"] for turn in answer["result"]], [t.axes for t in expected], atol=1e-12)
     assert "error" in call("around.js", "turnsAround", [{"x_range_m": [0, 9], "y_range_m": [1, 9]}, camera_view])[0]
-    for name in MODELS:
-        bundle = load_pillar_bundle(shipped_bundles()[name])
-        manifest = json.loads((shipped_bundles()[name] / "bundle.json").read_text())
+    for folder in MODELS:
+        bundle = load_pillar_bundle(folder)
+        manifest = json.loads((folder / "bundle.json").read_text())
         manifest["expected_input"]["camera_view"] = camera_view
         found = call("around.js", "widenRanges", [manifest])[0]["result"]
         looked = widen_ranges(replace(bundle, expected_input=replace(bundle.expected_input, camera_view=camera_view)))

@@ -29,11 +29,14 @@ from asca_pillars.scans.mounting import Mounting
 from asca_pillars.scans.scan_reader import read_scan, write_scan
 from tests.deploy.chromium import CHROMIUM, Tab, file_server, open_tab
 from tests.deploy.page_driver import assert_drawn, failure, finished, move_slider, status
+from tests.helpers.bundles import DENSE_FLOAT32, DENSE_INT8
 
 ORT_WEB = os.environ.get("ASCA_ORT_WEB")
 """npm's package onnxruntime-web, a .tgz or its folder."""
 NEAR_M = 0.02
 SCORE_TOLERANCE = 0.02
+
+MODELS = shipped_bundles() | {folder.name: folder for folder in (DENSE_FLOAT32, DENSE_INT8)}
 
 needs_ort_web = pytest.mark.skipif(not ORT_WEB, reason="needs ASCA_ORT_WEB, a .tgz of `npm pack onnxruntime-web`")
 needs_chromium = pytest.mark.skipif(CHROMIUM is None, reason="needs chromium")
@@ -58,15 +61,16 @@ def made_up_package(tmp_path: Path) -> Path:
 
 @needs_ort_web
 @needs_chromium
-@pytest.mark.parametrize("name", ["asca_small_sim", "asca_small_sim_int8", "asca_small_sparse_sim", "asca_sim_int8"])
+@pytest.mark.parametrize("name", ["dense_float32", "dense_int8", "default_float32", "default"])
 def test_the_browser_finds_the_boxes_that_python_finds(name: str, tmp_path: Path, tab: Tab) -> None:
     page = tmp_path / "page"
-    write_page(page, shipped_bundles()[name], sample_scan_path(), find_ort_web(Path(str(ORT_WEB))))
+    bundle = MODELS[name]
+    write_page(page, bundle, sample_scan_path(), find_ort_web(Path(str(ORT_WEB))))
     points = read_scan(sample_scan_path()).points
     write_scan(tmp_path / "half.bin", points[::2])
     write_scan(tmp_path / "ahead.bin", points[points[:, 0] > np.abs(points[:, 1])])
     write_scan(tmp_path / "outside.bin", points[:9] + np.array([500, 0, 0, 0], np.float32))
-    detector = Detector(name, threads=1)
+    detector = Detector(bundle, threads=1)
     with file_server(page) as address:
         tab.call("Page.navigate", url=address)
         assert_same(finished(tab, "sample.bin"), detector, points)
@@ -74,7 +78,8 @@ def test_the_browser_finds_the_boxes_that_python_finds(name: str, tmp_path: Path
         for score in (0.2, 0.9, detector.spec.classes[0].score_threshold):
             move_slider(tab, "Car", score)
             moved = {"Car": score}
-            assert_same(finished(tab, "sample.bin"), Detector(name, threads=1, score_threshold=moved), points, least=0)
+            expected = Detector(bundle, threads=1, score_threshold=moved)
+            assert_same(finished(tab, "sample.bin"), expected, points, least=0)
         tab.evaluate("document.getElementById('again').click()")
         warm = finished(tab, "sample.bin")
         tab.choose_file("#file", tmp_path / "half.bin")
@@ -101,10 +106,11 @@ def test_the_browser_finds_the_boxes_that_python_finds(name: str, tmp_path: Path
 
 @needs_ort_web
 @needs_chromium
-@pytest.mark.parametrize("name", ["asca_small_sim", "asca_sim"])
+@pytest.mark.parametrize("name", ["dense_float32", "default_float32"])
 def test_the_browser_looks_around_and_takes_a_mounting_as_python_does(name: str, tmp_path: Path, tab: Tab) -> None:
     page = tmp_path / "page"
-    write_page(page, shipped_bundles()[name], sample_scan_path(), find_ort_web(Path(str(ORT_WEB))))
+    bundle = MODELS[name]
+    write_page(page, bundle, sample_scan_path(), find_ort_web(Path(str(ORT_WEB))))
     points = read_scan(sample_scan_path()).points
     turned = Mounting(axes="-x,-y,z").level.inverse.points(points)
     raised = turned - np.array([0, 0, 0.4, 0], np.float32)
@@ -113,28 +119,29 @@ def test_the_browser_looks_around_and_takes_a_mounting_as_python_does(name: str,
         tab.call("Page.navigate", url=address)
         ahead = finished(tab, "sample.bin")
         set_sensor(tab, around=True)
-        around = Detector(name, threads=1, view="around")
+        around = Detector(bundle, threads=1, view="around")
         saved = finished(tab, "sample.bin")
         assert_same(saved, around, points, least=len(ahead["boxes"]) + 4)
         assert (saved["passes"], saved["warnings"]) == (4, []) and "in 4 passes" in status(tab)
         low = {"Car": 0.15, "Pedestrian": 0.2}
         for class_, score in low.items():
             move_slider(tab, class_, score)
-        assert_same(finished(tab, "sample.bin"), Detector(name, threads=1, view="around", score_threshold=low), points)
+        lower = Detector(bundle, threads=1, view="around", score_threshold=low)
+        assert_same(finished(tab, "sample.bin"), lower, points)
         for class_ in low:
             move_slider(tab, class_, next(c.score_threshold for c in around.spec.classes if c.name == class_))
         set_sensor(tab, around=False, axes="-x,-y,z", height="2.2")
         finished(tab, "sample.bin")
         tab.choose_file("#file", tmp_path / "raised.bin")
         mounting = Mounting(axes="-x,-y,z", sensor_height_m=2.2)
-        assert_same(finished(tab, "raised.bin"), Detector(name, threads=1, mounting=mounting), raised)
+        assert_same(finished(tab, "raised.bin"), Detector(bundle, threads=1, mounting=mounting), raised)
         set_sensor(tab, axes="-x,-y,z", height="auto")
         measured, estimate = measured_mounting([raised], mounting)
         saved = finished(tab, "raised.bin")
-        assert_same(saved, Detector(name, threads=1, mounting=measured), raised)
+        assert_same(saved, Detector(bundle, threads=1, mounting=measured), raised)
         assert f"{estimate.height_m:.2f} m above the ground" in saved["warnings"][-1]
         set_sensor(tab, axes="-x,-y,z", height="auto", around=True)
-        assert_same(finished(tab, "raised.bin"), Detector(name, threads=1, mounting=measured, view="around"), raised)
+        assert_same(finished(tab, "raised.bin"), Detector(bundle, threads=1, mounting=measured, view="around"), raised)
         set_sensor(tab, axes="up")
         assert "axes up: give x-forward, y-forward or" in failure(tab)
         set_sensor(tab)
@@ -145,7 +152,7 @@ def test_the_browser_looks_around_and_takes_a_mounting_as_python_does(name: str,
 @needs_chromium
 def test_the_browser_looks_around_in_one_pass_where_python_does(tmp_path: Path, tab: Tab) -> None:
     page, bundle = tmp_path / "page", tmp_path / "bundle"
-    shutil.copytree(shipped_bundles()["asca_small_sparse_sim"], bundle)
+    shutil.copytree(shipped_bundles()["fast"], bundle)
     described = json.loads((bundle / "bundle.json").read_text())
     described["expected_input"]["camera_view"] = False  # as if it were trained on whole revolutions
     (bundle / "bundle.json").write_text(json.dumps(described))
@@ -190,7 +197,7 @@ def assert_same(saved: Any, detector: Detector, points: NDArray[np.float32], lea
 
 
 def test_the_page_holds_what_it_needs_and_names_it(made_up_package: Path, tmp_path: Path) -> None:
-    page, bundle = tmp_path / "page", shipped_bundles()["asca_sim_int8"]
+    page, bundle = tmp_path / "page", shipped_bundles()["default"]
     options = ["--browser", "-o", str(page), "--ort-web", str(made_up_package)]
     for _ in range(2):  # and may be written again
         result = CliRunner().invoke(app, ["export", bundle.name, *options])
@@ -214,7 +221,7 @@ def test_the_page_holds_what_it_needs_and_names_it(made_up_package: Path, tmp_pa
 
 
 def test_the_zip_is_the_page_with_the_license_of_its_runtime(made_up_package: Path, tmp_path: Path) -> None:
-    page, bundle = tmp_path / "page", shipped_bundles()["asca_small_sim_int8"]
+    page, bundle = tmp_path / "page", DENSE_INT8
     write_page(page, bundle, sample_scan_path(), made_up_package)
     first = page_zip(page).read_bytes()
     write_page(page, bundle, sample_scan_path(), made_up_package)
@@ -228,7 +235,7 @@ def test_the_zip_is_the_page_with_the_license_of_its_runtime(made_up_package: Pa
 
 
 def test_a_zip_of_something_else_is_left_alone(made_up_package: Path, tmp_path: Path) -> None:
-    bundle, zipped = shipped_bundles()["asca_small_sim_int8"], tmp_path / "page.zip"
+    bundle, zipped = DENSE_INT8, tmp_path / "page.zip"
     with zipfile.ZipFile(zipped, "w") as archive:
         archive.writestr("page/page.json", "{}")
     for content in (zipped.read_bytes(), b"precious"):
@@ -242,20 +249,20 @@ def test_a_zip_of_something_else_is_left_alone(made_up_package: Path, tmp_path: 
 def test_a_stranger_s_names_of_graphs_do_not_reach_the_page(made_up_package: Path, tmp_path: Path, name: str) -> None:
     """Bytes of a graph may well be a script, and a page would run it."""
     bundle, page = tmp_path / "bundle", tmp_path / "page"
-    shutil.copytree(shipped_bundles()["asca_small_sim_int8"], bundle)
+    shutil.copytree(DENSE_INT8, bundle)
     described = json.loads((bundle / "bundle.json").read_text())
     (bundle / "backbone.onnx").rename(bundle / name)
     described["graphs"]["backbone"]["file"] = name
     (bundle / "bundle.json").write_text(json.dumps(described))
     write_page(page, bundle, sample_scan_path(), made_up_package)
-    write_page(tmp_path / "usual", shipped_bundles()["asca_small_sim_int8"], sample_scan_path(), made_up_package)
+    write_page(tmp_path / "usual", DENSE_INT8, sample_scan_path(), made_up_package)
     usual = {path.name: path.read_bytes() for path in (tmp_path / "usual").iterdir()}
     assert {path.name: path.read_bytes() for path in page.iterdir()} == usual
 
 
 def test_what_is_read_is_not_replaced(made_up_package: Path, tmp_path: Path) -> None:
     """A page is a bundle, too."""
-    page, bundle = tmp_path / "page", shipped_bundles()["asca_small_sim_int8"]
+    page, bundle = tmp_path / "page", DENSE_INT8
     write_page(page, bundle, sample_scan_path(), made_up_package)
     before = {path.name: path.read_bytes() for path in page.iterdir()}
     for read in ((page, sample_scan_path()), (bundle, page / "sample.bin")):
@@ -268,7 +275,7 @@ def test_what_is_read_is_not_replaced(made_up_package: Path, tmp_path: Path) -> 
 
 
 def test_a_package_that_is_none(made_up_package: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    bundle = shipped_bundles()["asca_small_sim_int8"]
+    bundle = DENSE_INT8
     monkeypatch.chdir(tmp_path)
     with pytest.raises(ConfigError, match="not in this folder; get it with `npm pack onnxruntime-web@"):
         find_ort_web(None)
@@ -286,15 +293,15 @@ def test_a_folder_of_something_else_is_left_alone(made_up_package: Path, tmp_pat
     (tmp_path / "page").mkdir()
     (tmp_path / "page" / "thesis.txt").write_text("precious")
     with pytest.raises(OutputError, match=r"thesis\.txt"):
-        write_page(tmp_path / "page", shipped_bundles()["asca_small_sim"], sample_scan_path(), made_up_package)
+        write_page(tmp_path / "page", DENSE_FLOAT32, sample_scan_path(), made_up_package)
 
 
 def test_a_bundle_that_the_page_cannot_run(made_up_package: Path, tmp_path: Path, monkeypatch) -> None:
-    bundle = load_pillar_bundle(shipped_bundles()["asca_sim_int8"])
+    bundle = load_pillar_bundle(shipped_bundles()["default"])
     pooled = replace(bundle.spec, grid=replace(bundle.spec.grid, zones=3, map="pooled"))
     monkeypatch.setattr("asca_deploy.browser_page.load_pillar_bundle", lambda _: replace(bundle, spec=pooled))
     with pytest.raises(BundleError, match="kind pillar, pooled map; the page runs"):
         write_page(tmp_path / "page", tmp_path, sample_scan_path(), made_up_package)
     with pytest.raises(BundleError, match="kind pillar_refine, warped map; the page runs"):
         monkeypatch.undo()
-        write_page(tmp_path / "page", shipped_bundles()["asca_refine_sim_int8"], sample_scan_path(), made_up_package)
+        write_page(tmp_path / "page", shipped_bundles()["accurate"], sample_scan_path(), made_up_package)

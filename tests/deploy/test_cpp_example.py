@@ -16,6 +16,7 @@ from asca_deploy.golden import write_golden
 from asca_pillars.ops.pillar.neck_rulebooks import MaskRule, NeckRulebookBuilder, rulebook_inputs
 from asca_pillars.scans.scan_reader import write_scan
 from tests.deploy import conftest as tiny
+from tests.helpers.bundles import DENSE_FLOAT32, DENSE_INT8
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "cpp"
 COMPILER = shutil.which("g++") or shutil.which("clang++")
@@ -70,7 +71,7 @@ def test_cmake_takes_an_unpacked_release(tmp_path: Path) -> None:
     stated = (f"-DONNXRUNTIME_ROOT={release}", f"-DNLOHMANN_JSON_INCLUDE={json_folder}")
     subprocess.run([cmake, "-S", EXAMPLE, "-B", tmp_path / "build", *stated], check=True, capture_output=True)
     subprocess.run([cmake, "--build", tmp_path / "build"], check=True, capture_output=True)
-    command = [tmp_path / "build" / "detect", shipped_bundles()["asca_sim_int8"], sample_scan_path()]
+    command = [tmp_path / "build" / "detect", shipped_bundles()["default"], sample_scan_path()]
     found = subprocess.run(command, check=True, capture_output=True, text=True).stdout
     assert "Car" in found
 
@@ -127,13 +128,13 @@ def assert_golden(detect: Path, bundle: Path, scan: Path, golden: Path, least: i
 
 
 def test_it_finds_the_boxes_of_the_models_that_ship(detect: Path, tmp_path: Path) -> None:
-    for name in ("asca_small_sim", "asca_small_sim_int8", "asca_small_sparse_sim", "asca_sim_int8"):
-        assert_golden(detect, shipped_bundles()[name], sample_scan_path(), tmp_path / name)
+    for folder in (DENSE_FLOAT32, DENSE_INT8, shipped_bundles()["default_float32"], shipped_bundles()["default"]):
+        assert_golden(detect, folder, sample_scan_path(), tmp_path / folder.name)
 
 
 def test_it_leaves_nothing_behind(detect: Path, tmp_path: Path) -> None:
     """onnxruntime writes an identifier to the home folder when it is going to report."""
-    command = [detect, shipped_bundles()["asca_small_sim"], sample_scan_path()]
+    command = [detect, DENSE_FLOAT32, sample_scan_path()]
     subprocess.run(command, check=True, capture_output=True, env={"HOME": str(tmp_path)})
     assert list(tmp_path.iterdir()) == []
 

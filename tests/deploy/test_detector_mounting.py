@@ -113,7 +113,7 @@ def test_a_turned_scan_gives_turned_boxes() -> None:
     plane = fit_ground_plane(points)
     assert plane is not None and plane.doubt is None
     points[:, 2] += points[:, :2] @ np.array(plane.normal[:2], np.float32) / plane.normal[2]
-    detector = Detector("asca_sim", view="around")
+    detector = Detector("default_float32", view="around")
     assert detector.passes == 4
     turn = FrameChange.turn(np.pi / 2)
     expected, found = detector(points), detector(turn.points(points))

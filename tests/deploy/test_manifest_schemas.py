@@ -1,48 +1,24 @@
-"""Manifests of the schema before, and every field of either: a change is refused, or without effect on boxes."""
+"""Manifests without keys that came later, and every field of one: a change is refused, or without effect on boxes."""
 
 import json
 import shutil
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import onnx
-import pytest
-from numpy.typing import NDArray
 
-from asca_deploy import Detector
 from asca_deploy.bundle import MANIFEST, PvRcnnBundle
 from asca_deploy.manifest import graph_files, load_bundle, load_pillar_bundle
-from asca_deploy.shipped import shipped_bundles
 from asca_pillars.base.errors import BundleError
 from asca_pillars.base.schema import to_dict
 from tests.deploy.edited_manifest import NOT_THE_GRAPHS, assert_refused, edit
-
-
-def as_schema_2(folder: Path) -> Path:
-    """The bundle as the version before schema 3 wrote it."""
-    data = json.loads((folder / MANIFEST).read_text())
-    pillar = {key: value for key, value in data.pop("pillar").items() if key not in ("neck", "active_cells")}
-    for key in ("kind", "expected_input_from"):
-        del data[key]
-    del data["expected_input"]["camera_view"]
-    if data["quantization"]:
-        del data["quantization"]["dropped_scans"]
-    data |= {"schema_version": 2, **pillar}
-    for name in ("encoder", "backbone"):
-        model = onnx.load(folder / f"{name}.onnx")
-        stamped = {key: data[key] for key in ("schema_version", "name", "cpa", "license", "spec", "layout")}
-        onnx.helper.set_model_props(model, {key: json.dumps(value) for key, value in stamped.items()})
-        onnx.save(model, folder / f"{name}.onnx")
-        data["graphs"][name]["sha256"] = graph_files(folder)[name].sha256
-    (folder / MANIFEST).write_text(json.dumps(data))
-    return folder
+from tests.helpers.bundles import DENSE_INT8, PV_RCNN
 
 
 def test_a_bundle_that_names_no_neck_has_a_dense_one(tmp_path: Path) -> None:
-    folder = Path(shutil.copytree(shipped_bundles()["asca_small_sim_int8"], tmp_path / "int8"))
+    folder = Path(shutil.copytree(DENSE_INT8, tmp_path / "int8"))
     assert "neck" not in json.loads((folder / MANIFEST).read_text())["pillar"]
     section = load_pillar_bundle(folder).pillar
     assert (section.neck, section.active_cells) == ("dense", None)
@@ -51,7 +27,7 @@ def test_a_bundle_that_names_no_neck_has_a_dense_one(tmp_path: Path) -> None:
 
 
 def test_refined_boxes_of_an_older_bundle_have_the_scores_that_they_had(tmp_path: Path) -> None:
-    folder = Path(shutil.copytree(shipped_bundles()["pvrcnn_small_sim"], tmp_path / "older"))
+    folder = Path(shutil.copytree(PV_RCNN, tmp_path / "older"))
     data = json.loads((folder / MANIFEST).read_text())
     assert data["pv_rcnn"].pop("scores") == "both"
     for graph in data["graphs"].values():
@@ -63,15 +39,6 @@ def test_refined_boxes_of_an_older_bundle_have_the_scores_that_they_had(tmp_path
     (folder / MANIFEST).write_text(json.dumps(data))
     bundle = load_bundle(folder)
     assert isinstance(bundle, PvRcnnBundle) and bundle.pv_rcnn.scores == "second"
-
-
-def test_schema_2_is_read_as_kind_pillar(tiny_bundle: Path, bundle_copy: Path, scan: NDArray[np.float32]) -> None:
-    now, then = load_pillar_bundle(tiny_bundle), load_pillar_bundle(as_schema_2(bundle_copy))
-    expected = replace(now.expected_input, camera_view=True)
-    assert then == replace(now, graphs=then.graphs, expected_input=expected, expected_input_from="export")
-    assert np.array_equal(Detector(bundle_copy)(scan).boxes, Detector(tiny_bundle)(scan).boxes)
-    edit(bundle_copy, lambda data: data["spec"]["classes"][0].update(length_m=13.9))
-    assert_refused(bundle_copy, NOT_THE_GRAPHS.format("spec"))
 
 
 WITHOUT_EFFECT_ON_BOXES = (
@@ -116,12 +83,9 @@ def leaves(value: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
         yield from leaves(inner, (*path, key))
 
 
-@pytest.mark.parametrize("old", [False, True], ids=["schema 3", "schema 2"])
-def test_every_field_is_refused_or_harmless(tmp_path: Path, old: bool) -> None:
+def test_every_field_is_refused_or_harmless(tmp_path: Path) -> None:
     """Each value of an int8 manifest replaced or taken out: one line, or the same boxes."""
-    folder = Path(shutil.copytree(shipped_bundles()["asca_small_sim_int8"], tmp_path / "int8"))
-    if old:
-        as_schema_2(folder)
+    folder = Path(shutil.copytree(DENSE_INT8, tmp_path / "int8"))
     good, text = load_pillar_bundle(folder), (folder / MANIFEST).read_text()
     paths = [path for path in leaves(json.loads(text)) if path]
     assert len(paths) > 150
@@ -145,8 +109,7 @@ def test_every_field_is_refused_or_harmless(tmp_path: Path, old: bool) -> None:
                 refused += 1
                 continue
             assert found.spec == good.spec and found.graphs == good.graphs, path
-            if not old:  # schema 2 did not stamp the canvas, the precision and the name
-                assert (found.pillar, found.precision) == (good.pillar, good.precision), path
-                same = data == json.loads(text) or path[0] in WITHOUT_EFFECT_ON_BOXES
-                assert same, f"{path} = {parent[path[-1]]} was taken"
+            assert (found.pillar, found.precision) == (good.pillar, good.precision), path
+            same = data == json.loads(text) or path[0] in WITHOUT_EFFECT_ON_BOXES
+            assert same, f"{path} = {parent[path[-1]]} was taken"
     assert refused > 300

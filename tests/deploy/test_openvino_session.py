@@ -20,6 +20,7 @@ from asca_pillars.base.errors import BundleError, ProviderError
 from asca_pillars.detection.decode import HeadMaps
 from asca_pillars.scans.scan_reader import read_scan
 from tests.deploy.conftest import needs_openvino
+from tests.helpers.bundles import DENSE_FLOAT32, DENSE_INT8
 
 pytestmark = needs_openvino
 
@@ -32,9 +33,9 @@ by_backend = pytest.mark.parametrize("backend", BACKENDS)
 
 
 def maps_and_boxes(
-    precision: str | None, bundle: str = "asca_small_sim"
+    precision: str | None, bundle: Path = DENSE_FLOAT32
 ) -> tuple[HeadMaps[NDArray[np.float32]], Detections, Detector]:
-    """Of the sample scan by a bundle that ships, in OpenVINO; None for the stock CPU."""
+    """Of the sample scan by a bundle, in OpenVINO; None for the stock CPU."""
     where = {} if precision is None else {"provider": "openvino", "precision": precision}
     detector = Detector(bundle, **where)  # type: ignore[arg-type]
     pipeline = detector.pipeline
@@ -52,8 +53,8 @@ def test_float32_is_what_the_stock_cpu_computes() -> None:
 
 def test_8_bits_are_the_same_8_bits() -> None:
     """Sums of 8-bit products are exact; only which way a tie between two steps falls may differ."""
-    name = "asca_small_sim_int8"
-    (expected, boxes, detector), (found, same_boxes, _) = maps_and_boxes(None, name), maps_and_boxes("float32", name)
+    expected, boxes, detector = maps_and_boxes(None, DENSE_INT8)
+    found, same_boxes, _ = maps_and_boxes("float32", DENSE_INT8)
     assert auto.disagreement(boxes, same_boxes, detector.spec) is None
     for ours, theirs in zip(found, expected, strict=True):
         assert np.sqrt(np.square(ours - theirs).mean()) < 0.005 * theirs.std()

@@ -28,7 +28,7 @@ from tests.deploy.chromium import CHROMIUM, open_tab
 from tests.deploy.page_driver import assert_drawn, failure, finished, move_slider
 
 POINTS = read_scan(sample_scan_path()).points[::2].copy()
-SMALL = RuntimeOptions(bundle="asca_small_sparse_sim_int8", threads=1)
+SMALL = RuntimeOptions(bundle="fast", threads=1)
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +43,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @contextmanager
-def serving(*args: Any, bundle: str = "asca_small_sparse_sim_int8", **kwargs: Any) -> Iterator[ScanServer]:
+def serving(*args: Any, bundle: str = "fast", **kwargs: Any) -> Iterator[ScanServer]:
     with ScanServer(*args, options=RuntimeOptions(bundle=bundle, threads=1), **kwargs) as server:
         thread = threading.Thread(target=server.serve)
         thread.start()
@@ -106,7 +106,7 @@ def shown(page: Any, found: Any) -> list[Any]:
 
 def test_what_several_passes_find_is_not_lowered() -> None:
     """Of two passes the box stays that is seen nearest to straight ahead, whatever the scores."""
-    with serving([sample_scan_path()], bundle="asca_small_sim_int8", around=True) as server:
+    with serving([sample_scan_path()], bundle="fast", around=True) as server:
         classes = json.loads(get(server, "page.json"))["classes"]
     assert [one["lowest"] for one in classes] == [one["score"] for one in classes]
 

@@ -8,6 +8,7 @@ import torch
 
 from asca_deploy import shipped
 from asca_deploy.shipped import find_checkpoint
+from asca_pillars.base import installation
 from asca_pillars.base.errors import BundleError, TrainingError
 from asca_pillars.config.pillar import PillarModel
 from asca_pillars.models.checkpoint import load_checkpoint
@@ -25,7 +26,8 @@ def test_a_run_can_start_from_other_weights(tmp_path: Path, monkeypatch: pytest.
     bundle = tmp_path / "bundle"
     bundle.mkdir()
     first.with_name("weights.ckpt").rename(bundle / "weights.ckpt")
-    monkeypatch.setattr(shipped, "shipped_bundles", lambda: {"a_model": bundle})
+    for module in (shipped, installation):
+        monkeypatch.setattr(module, "shipped_models", lambda: {"a_model": bundle})
     sources: dict[str | Path, Path] = {
         first: first,
         bundle: bundle / "weights.ckpt",
@@ -39,7 +41,7 @@ def test_a_run_can_start_from_other_weights(tmp_path: Path, monkeypatch: pytest.
             torch.testing.assert_close(parameter, expected, msg=f"{parameter.shape} from {init}")
     for init, error, message in (
         (first, TrainingError, r"another network: \S+ is \(16, 9\) there and \(8, 9\) in this configuration"),
-        ("another", BundleError, "no bundle of that name ships, only a_model"),
+        ("another", BundleError, "no bundle of that name ships"),
         (data, BundleError, r"data: holds no weights\.ckpt, .* a_model has one"),
         (tmp_path / "none.ckpt", TrainingError, "no such checkpoint"),
     ):

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from asca_pillars.base.errors import BundleError, ConfigError
 from asca_pillars.base.files import WEIGHTS_FILE
 from asca_pillars.base.input_files import read_text, require_content
-from asca_pillars.base.installation import shipped_bundles
+from asca_pillars.base.installation import find_shipped
 from asca_pillars.base.schema import parse
 from asca_pillars.config.pillar import PillarModel
 from asca_pillars.config.two_stage import RefineModel
@@ -139,7 +139,7 @@ def _find_weights(source: str) -> _Weights:
     path = Path(source)
     if path.suffix == Path(WEIGHTS_FILE).suffix or path.is_file():
         return _Weights(path)
-    folder = path if path.exists() else shipped_bundles().get(source)
+    folder = path if path.exists() else find_shipped(source)
     if folder is None:
         raise BundleError(
             f"{source}: no such bundle or checkpoint; set model.first_stage to the folder of one that was exported "

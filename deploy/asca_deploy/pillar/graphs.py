@@ -17,11 +17,6 @@ _NO_SPARSE_NECK = {
     "openvino": "it needs outputs of fixed shapes",
     "tensorrt": "it would build another engine for every number of pillars",
 }
-_DENSE_FORMS = {
-    "pillar": ", or what `asca export SOURCE --dense-neck` writes of the checkpoint, or of asca_sim",
-    "pillar_refine": "",
-}
-"""End of the error message by kind: other bundles that do run."""
 
 
 def encoder_interface(bundle: PillarBundle) -> Interface:
@@ -81,5 +76,5 @@ def check_neck(bundle: PillarBundle, provider: str) -> None:
     if bundle.pillar.neck == "sparse" and provider in _NO_SPARSE_NECK:
         raise ProviderError(
             f"provider {provider} cannot run the sparse neck of {bundle.name}: {_NO_SPARSE_NECK[provider]}; "
-            f"choose provider cpu, or a bundle with a dense neck: asca_small_sim{_DENSE_FORMS[bundle.kind]}"
+            "choose provider cpu, or a dense neck, as `asca export default --dense-neck` makes it of a pillar detector"
         )

@@ -166,7 +166,7 @@ class DenseBackbone:
 
     Every scan between `place` and `run` has a canvas of its own, taken from those that are free. There are as many
     as there ever were such scans at once: one in single calls, two in a stream, one per thread with several threads;
-    each takes (nx + 1)(ny + 1) C values, 5 MiB in asca_small_sim_int8 and 20 MiB in its float form.
+    each takes (nx + 1)(ny + 1) C values, 5 MiB for 32 channels in 8 bits and 20 MiB in float32.
 
     Args:
         session: that has opened it, see `open_backbone`.

@@ -149,6 +149,12 @@ def _neck_gains(
 def _first_bundle(source: str, temporary: Path, scans: Sequence[NDArray[np.float32]], options: ExportOptions) -> Path:
     """Return the first stage's folder, with `options.calibration` in 8 bits; `temporary` is for exports."""
     if not is_checkpoint(source):
-        return find_bundle(source if options.calibration is None else f"{source.rstrip('/')}_int8")
+        return find_bundle(source if options.calibration is None else _in_eight_bits(source.rstrip("/")))
     export_pillar_bundle(load_checkpoint(source), temporary, scans, options)
     return temporary
+
+
+def _in_eight_bits(bundle: str) -> str:
+    """Return the name of a float32 bundle's 8-bit form: default of default_float32, mine_int8 of mine."""
+    stem = bundle.removesuffix("_float32")
+    return f"{bundle}_int8" if stem == bundle else stem

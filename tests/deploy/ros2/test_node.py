@@ -69,7 +69,7 @@ def ended(process: subprocess.Popen[str], kind: signal.Signals) -> tuple[list[di
 
 @pytest.mark.parametrize("kind", ["RELIABLE", "BEST_EFFORT"])
 def test_every_scan_of_both_kinds_of_publisher_is_answered(environment: dict[str, str], kind: str) -> None:
-    with node(environment, "--bundle", "asca_small_sparse_sim_int8") as process:
+    with node(environment, "--bundle", "fast") as process:
         heard = published(environment, kind, 10)
         log, seconds = ended(process, signal.SIGINT)
     numbers = [number for number, _ in heard["answers"]]
@@ -84,7 +84,7 @@ def test_every_scan_of_both_kinds_of_publisher_is_answered(environment: dict[str
 
 
 def test_a_publisher_that_dies_and_another_kind_that_comes(environment: dict[str, str]) -> None:
-    with node(environment, "--track", "--bundle", "asca_small_sparse_sim_int8") as process:
+    with node(environment, "--track", "--bundle", "fast") as process:
         first, second = published(environment, "RELIABLE", 3), published(environment, "BEST_EFFORT", 3)
         log, _ = ended(process, signal.SIGTERM)
     assert first["answers"] and second["answers"]

@@ -265,7 +265,7 @@ def test_what_cannot_be_scored_is_refused(drives: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["asca_sim"], "asca_sim: --protocol tracking runs no model"),
+        (["fast"], "fast: --protocol tracking runs no model"),
         (["--around"], "--around runs a model"),
         (["--labels", "x"], "--labels x belongs to --protocol kitti and waymo"),
         (["--gallery", "3"], "--gallery 3 belongs to --protocol kitti"),

@@ -4,7 +4,6 @@ import json
 import os
 import shutil
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,12 +11,11 @@ import onnx
 import onnxruntime
 import pytest
 import torch
-import typer
 
 from asca_deploy import Detector
-from asca_deploy.manifest import load_pillar_bundle, write_bundle_manifest
+from asca_deploy.manifest import load_pillar_bundle
 from asca_deploy.pillar.pipeline import PillarPipeline
-from asca_export import graphs, reissue
+from asca_export import graphs
 from asca_export.fast_forms import FastBackbone
 from asca_export.parity import BOX_TOLERANCE_M, MAP_TOLERANCE, YAW_TOLERANCE_RAD, compare_boxes
 from asca_export.pillar.export import export_pillar_bundle
@@ -31,7 +29,7 @@ from asca_pillars.ops.pillar.prepare import PillarLimits
 from asca_pillars.ops.pillar.spec import PillarSpec
 from asca_pillars.scans.expected_input import ExpectedInput
 from asca_pillars.scans.measure_input import measure_expected_input
-from asca_pillars.scans.scan_reader import read_scan, write_scan
+from asca_pillars.scans.scan_reader import read_scan
 from tests.export.tiny import SCANS, tiny_checkpoint, tiny_detector
 from tests.helpers.scenes import SPEC
 
@@ -127,24 +125,6 @@ def test_the_expected_input_is_the_checkpoints_own(exported: Exports, tmp_path: 
     copied = export_pillar_bundle(checkpoint._replace(expected_input=known), tmp_path / "copied", SCANS)
     assert load_pillar_bundle(tmp_path / "copied") == copied
     assert (copied.expected_input, copied.expected_input_from) == (known, "training")
-
-
-def test_a_bundle_issued_again_runs_the_same_networks(exported: Exports, tmp_path: Path) -> None:
-    folder = shutil.copytree(exported("none"), tmp_path / "old")
-    described = load_pillar_bundle(folder)
-    provenance = replace(described.provenance, weights_file="weights.ckpt")
-    write_bundle_manifest(folder, replace(described, provenance=provenance))
-    (folder / "weights.ckpt").write_bytes(b"weights")
-    (tmp_path / "scans").mkdir()
-    for number, points in enumerate(SCANS[:2]):
-        write_scan(tmp_path / "scans" / f"{number}.bin", points)
-    reissue.main(folder, tmp_path / "scans", tmp_path / "new", camera_view=True, training=True)
-    old, new = load_pillar_bundle(folder), load_pillar_bundle(tmp_path / "new")
-    assert (tmp_path / "new" / "weights.ckpt").read_bytes() == b"weights"
-    assert new.expected_input == measure_expected_input(SCANS[:2], camera_view=True)
-    assert new == replace(old, expected_input=new.expected_input, expected_input_from="training", graphs=new.graphs)
-    with pytest.raises(typer.BadParameter, match="exists"):
-        reissue.main(folder, tmp_path / "scans", tmp_path / "new")
 
 
 def test_too_few_scans_are_refused(tmp_path: Path) -> None:

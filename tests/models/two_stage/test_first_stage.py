@@ -27,6 +27,7 @@ from asca_pillars.ops.two_stage.first_stage import (
     second_stage_inputs,
 )
 from tests.export.tiny import CALIBRATION, NETWORK, SCANS, tiny_checkpoint
+from tests.helpers.bundles import DENSE_FLOAT32
 from tests.helpers.saved_checkpoint import save_checkpoint
 from tests.helpers.scenes import SPEC
 from tests.models.two_stage.tiny_refine import tiny_refine_model
@@ -113,15 +114,15 @@ def test_rows_of_active_cells_are_a_map_with_zeros_beside_them(tmp_path: Path) -
 
 
 def test_a_second_stage_is_not_trained_on_eight_bits() -> None:
-    with pytest.raises(ConfigError, match="asca_small_sim_int8: a bundle in int8; give one in float32"):
-        open_first_stage("asca_small_sim_int8")
-    with pytest.raises(ExportError, match="asca_small_sim_int8: a bundle in int8; give one in float32"):
-        open_exported("asca_small_sim_int8")
+    with pytest.raises(ConfigError, match="fast: a bundle in int8; give one in float32"):
+        open_first_stage("fast")
+    with pytest.raises(ExportError, match="fast: a bundle in int8; give one in float32"):
+        open_exported("fast")
 
 
 def test_the_first_stage_of_the_bundle_that_ships_is_known_by_its_unrounded_weights() -> None:
-    folder = shipped_bundles()["asca_sim"]
-    stage = open_first_stage("asca_sim")
+    folder = shipped_bundles()["default_float32"]
+    stage = open_first_stage("default_float32")
     bundle = load_pillar_bundle(folder)
     assert stage.identity == bundle.provenance.weights_sha256 and stage.spec == bundle.spec
     maps, exported = (each(SCANS[0]).maps for each in (stage, BundleFirstStage(folder)))
@@ -133,8 +134,8 @@ def test_bundles_whose_weights_cannot_be_taken(tmp_path: Path) -> None:
     save_checkpoint(tmp_path / "first.ckpt", checkpoint)
     with pytest.raises(BundleError, match=r"no such bundle or checkpoint; set model\.first_stage"):
         open_first_stage("asca_smal")
-    with pytest.raises(BundleError, match=r"asca_small_sim: holds no weights\.ckpt, .* --with-weights"):
-        open_first_stage("asca_small_sim")
+    with pytest.raises(BundleError, match=r"dense_float32: holds no weights\.ckpt, .* --with-weights"):
+        open_first_stage(str(DENSE_FLOAT32))
     export_pillar_bundle(checkpoint, tmp_path / "bundle", SCANS, ExportOptions(weights=tmp_path / "first.ckpt"))
     shutil.copyfile(tmp_path / "first.ckpt", tmp_path / "bundle" / "weights.ckpt")
     with pytest.raises(BundleError, match=r"weights\.ckpt: is damaged, or of another bundle"):
