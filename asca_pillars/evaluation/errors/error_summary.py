@@ -100,6 +100,8 @@ def _interval(drawn: _Doubles) -> tuple[float, float]:
     return float(low), float(high)
 
 
+FALSE_RATES = (0.05, 0.1, 0.2, 0.3, 0.5)
+"""False detections a frame that score thresholds are given for."""
 CLEAR_RANGE_M = 35.0
 CLEAR_TRUNCATION = 0.1
 SIDE_ON_DEG = 90.0 - END_ON_DEG
@@ -176,12 +178,28 @@ class FalseDetections(Strict):
 
 
 @dataclass(frozen=True)
+class FalseRate(Strict):
+    """The lowest score threshold with at most so many false detections a frame.
+
+    Attributes:
+        per_frame: false detections a frame that are allowed.
+        score: threshold.
+        recall: share of the counted objects that are found from it on.
+    """
+
+    per_frame: float
+    score: float
+    recall: float
+
+
+@dataclass(frozen=True)
 class ClassErrors(Strict):
     """All results of one class.
 
     Attributes:
         score: score threshold.
         best_score: the score with the best F1 at the BEV IoU of a found object; None without a found object.
+        false_rates: of each of FALSE_RATES, without those that no score reaches.
         iou_3d: 3D IoU for `reaching`: KITTI's of the class, OTHER_IOU_3D for any other.
         boxes: boxes on counted objects, found or inaccurate.
         reaching: share of them that reach it as predicted, and with each of CORRECTIONS or WITHOUT_MEDIANS.
@@ -191,6 +209,7 @@ class ClassErrors(Strict):
     class_name: str
     score: float
     best_score: float | None
+    false_rates: tuple[FalseRate, ...]
     iou_3d: float
     boxes: int
     reaching: dict[str, float]
@@ -322,6 +341,7 @@ class _Part:
             class_name=name,
             score=self.matches.scores[name],
             best_score=_best_score([item for item, _ in detections], int(counted.sum())),
+            false_rates=_false_rates([item for item, _ in detections], int(counted.sum()), int(self.frames.sum())),
             iou_3d=iou,
             boxes=int((counted & boxes).sum()),
             reaching=_shares_reaching(labels[counted[boxes]], residuals[counted & boxes], iou),
@@ -439,6 +459,22 @@ def _shares_reaching(labels: NDArray[np.float64], residuals: NDArray[np.float64]
     systematic[turned] = 0.0
     boxes[WITHOUT_MEDIANS] = boxes_from_residuals(labels, residuals - systematic)
     return {name: float(np.mean(paired_iou_3d(own, labels) >= iou)) for name, own in boxes.items()}
+
+
+def _false_rates(detections: list[DetectionMatch], counted: int, frames: int) -> tuple[FalseRate, ...]:
+    """Return thresholds for FALSE_RATES; detections of equal scores are reported together."""
+    judged = sorted((item for item in detections if item.kind != "ignored"), key=lambda item: -item.score)
+    scores = np.array([item.score for item in judged])
+    last_of_score = np.flatnonzero(np.append(np.diff(scores) != 0, True)[: len(scores)])
+    found = np.cumsum([item.kind == "found" for item in judged], dtype=np.int64)[last_of_score]
+    false = np.cumsum([item.kind != "found" for item in judged], dtype=np.int64)[last_of_score]
+    rates = []
+    for per_frame in FALSE_RATES:
+        allowed = np.flatnonzero(false <= per_frame * frames + 1e-9)
+        if len(allowed) and counted:
+            row = allowed[-1]
+            rates.append(FalseRate(per_frame, float(scores[last_of_score[row]]), float(found[row] / counted)))
+    return tuple(rates)
 
 
 def _best_score(detections: list[DetectionMatch], counted: int) -> float | None:

@@ -7,6 +7,7 @@ from asca_pillars.evaluation.errors.error_summary import (
     BLOCK_FRAMES,
     CLEAR_RANGE_M,
     CLEAR_TRUNCATION,
+    FALSE_RATES,
     LARGELY_OCCLUDED,
     MAIN_GROUPS,
     MIN_BLOCKS,
@@ -51,7 +52,7 @@ def error_tables(datasets: Sequence[DatasetErrors]) -> list[TextTable]:
     names = _class_names(datasets)
     tables = [_box_table(datasets, name, main=True) for name in names]
     tables += [_reaching_table(datasets, names), _false_table(datasets, names), _background_table(datasets, names)]
-    tables.append(_fit_table(datasets, names))
+    tables += [_false_rate_table(datasets, names), _fit_table(datasets, names)]
     return [table for table in tables if table.rows]
 
 
@@ -138,6 +139,22 @@ def _false_table(datasets: Sequence[DatasetErrors], names: Sequence[str]) -> Tex
             rows.append((name, data.name, str(data.frames), f"{one.score:.2f}", best, per_frame, *kinds, on))
     columns = ("class", "dataset", "frames", "score", "best F1 at", "false per frame", *FALSE_KINDS, "on labels of")
     return TextTable("False detections from the score on", columns, tuple(rows))
+
+
+def _false_rate_table(datasets: Sequence[DatasetErrors], names: Sequence[str]) -> TextTable:
+    rows = []
+    for name in names:
+        for data in datasets:
+            one = _class_of(data, name)
+            rates = {} if one is None else {rate.per_frame: rate for rate in one.false_rates}
+            if rates:
+                cells = [
+                    f"{rate.score:.2f} ({rate.recall:.2f})" if (rate := rates.get(each)) else _NONE
+                    for each in FALSE_RATES
+                ]
+                rows.append((name, data.name, *cells))
+    title = "Lowest score with at most so many false detections a frame (share of the objects found)"
+    return TextTable(title, ("class", "dataset", *(f"{rate:g} a frame" for rate in FALSE_RATES)), tuple(rows))
 
 
 def _background_table(datasets: Sequence[DatasetErrors], names: Sequence[str]) -> TextTable:

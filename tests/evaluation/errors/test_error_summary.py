@@ -1,11 +1,14 @@
 """Numbers about datasets whose errors are known."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
 from asca_pillars.evaluation.errors.error_summary import (
     ALL,
     CLEAR,
+    FALSE_RATES,
     WITHOUT_MEDIANS,
     ClassErrors,
     DatasetErrors,
@@ -130,8 +133,28 @@ def test_false_detections_and_the_best_score() -> None:
     assert one.false.traits["tall"] == 1 and one.false.traits["none"] == 0 and one.false.traits["low"] == 0
     assert one.false.surroundings["top_m"].middle == pytest.approx(2.75, abs=0.06)
     assert one.best_score == 0.9
+    assert [dataclasses.astuple(rate) for rate in one.false_rates] == [(allowed, 0.9, 0.5) for allowed in FALSE_RATES]
     everything = group(one, ALL)
     assert (everything.objects, everything.found, everything.below_score) == (20, 10, 0)
+
+
+def test_thresholds_by_false_detections_a_frame() -> None:
+    """Ten frames of one object each; a false one in every frame, of scores 0.31, 0.32, ... in turn."""
+    frames = {
+        str(number): frame(
+            [("Pedestrian", WALKER)],
+            [
+                ("Pedestrian", 0.345 if number < 8 else 0.2, WALKER),
+                ("Pedestrian", 0.31 + number / 100, np.add(WALKER, [-2, -3, 0, 0, 0, 0, 0])),
+            ],
+            points=ground(),
+        )
+        for number in range(10)
+    }
+    (data,) = summarize(match_frames(MadeFrames(frames), {"Pedestrian": 0.3}), "made", {})
+    rates = {rate.per_frame: (rate.score, rate.recall) for rate in only(data).false_rates}
+    expected = {0.1: (0.4, 0.0), 0.2: (0.39, 0.0), 0.3: (0.38, 0.0), 0.5: (0.36, 0.0)}
+    assert rates == {rate: (pytest.approx(score), recall) for rate, (score, recall) in expected.items()}
 
 
 def test_hidden_objects_say_nothing_about_their_labels() -> None:
