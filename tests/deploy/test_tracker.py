@@ -57,6 +57,15 @@ def test_a_person_does_not_take_the_track_of_a_car() -> None:
     assert tracker(found((10, 0, 0.9, 1)), 0.1).track_ids.tolist() == [1]
 
 
+@pytest.mark.parametrize(("aside_m", "track_id"), [(0.6, 0), (0.9, 1)])
+def test_a_detection_beyond_the_gate_is_somebody_else(aside_m: float, track_id: int) -> None:
+    """Of one who stands still 99 % of the detections are within 0.8 m of where the last two seconds place him."""
+    tracker = Tracker()
+    for step in range(20):
+        tracker(found((10, 0, 0.9, 1)), step / 10)
+    assert tracker(found((10, aside_m, 0.9, 1)), 2.0).track_ids.tolist() == [track_id]
+
+
 def test_a_track_survives_a_gap_and_ends_after_a_longer_one() -> None:
     tracker = Tracker(max_unseen_s=0.5)
     for step in range(10):

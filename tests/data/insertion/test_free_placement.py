@@ -157,6 +157,15 @@ def test_what_is_behind_an_inserted_object_disappears() -> None:
     assert scene.frame_with_inserted(min_points=int(left) + 1).labels.tolist() == [IGNORED, 1, 2]
 
 
+def test_an_inserted_object_needs_as_many_points_as_a_labelled_one() -> None:
+    """Exactly so many are enough."""
+    scene = Scene(frame_of(cast(LEVEL, NO_BOXES), NO_BOXES, []), NO_BOXES)
+    item = scanned(stand("Car", 10, 0), label=2)
+    scene.add(item)
+    for more, label in ((0, 2), (1, IGNORED)):
+        assert scene.frame_with_inserted(min_points=len(item.points) + more).labels.tolist() == [label]
+
+
 def test_a_scan_drawn_with_the_object_in_it_is_what_insertion_gives() -> None:
     """Ground truth: cast the rays once more with the object standing there."""
     boxes = np.array([stand("Car", 18, 3, 0.4), stand("Pedestrian", 12, -3)])
