@@ -193,6 +193,17 @@ def test_objects_do_not_hide_one_another() -> None:
         assert not scene.keeps_all_visible(scanned(second)) and scene.keeps_all_visible(scanned(beside))
 
 
+def test_a_car_hides_the_edge_of_one_that_stands_beside_its_shadow() -> None:
+    near, far = scanned(stand("Car", 10, 0, np.pi / 2)), scanned(stand("Car", 20, 4.5, np.pi / 2))
+    left = int((~rays_entering(far.points, near.box[None])).sum())
+    assert 0 < left < len(far.points)
+    for items in ((far, near), (near, far)):
+        scene = Scene(frame_of(cast(LEVEL, NO_BOXES), NO_BOXES, []), NO_BOXES)
+        for item in items:
+            scene.add(item)
+        assert points_in_boxes(scene.frame_with_inserted(1).points, far.box[None]).sum() == left
+
+
 def test_inserted_objects_hide_each_other() -> None:
     """As GT-Aug may place them: the one behind loses its points, in either order, and then its label."""
     far, near = scanned(stand("Pedestrian", 16, 0), 1), scanned(stand("Car", 10, 0, np.pi / 2), 0)
