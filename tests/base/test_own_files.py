@@ -187,6 +187,14 @@ def test_an_earlier_output_with_a_foreign_file_is_not_replaced(tmp_path: Path, f
         require_replaceable(target, *EXPORT)
 
 
+def test_a_folder_with_the_name_of_an_earlier_output_s_file_is_not_replaced(tmp_path: Path) -> None:
+    target = old_bundle(tmp_path / "bundle")
+    (target / "a.onnx").unlink()
+    write_text(target / "a.onnx" / "notes.txt", "precious")
+    with pytest.raises(OutputError, match=r"a\.onnx: `asca export` did not write it"):
+        require_replaceable(target, *EXPORT)
+
+
 def test_a_link_in_an_earlier_output_is_not_replaced(tmp_path: Path) -> None:
     target = old_bundle(tmp_path / "bundle")
     (target / "a.onnx").rename(tmp_path / "a.onnx")

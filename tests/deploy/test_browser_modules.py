@@ -32,7 +32,7 @@ from benchmarks.fuzz_inputs import Kind, read_points, scan_seeds
 from tests.deploy import conftest as tiny
 from tests.helpers.bundles import DENSE_FLOAT32, DENSE_INT8
 from tests.scans import scan_files
-from tests.scans.pcd_cases import CASES
+from tests.scans.pcd_cases import CASES, LZF_STREAMS
 
 ROOT = Path(__file__).parents[2]
 MODULES = ROOT / "deploy" / "asca_deploy" / "browser"
@@ -254,6 +254,11 @@ def test_the_ground_of_the_color_ramp_is_that_of_the_pictures() -> None:
     answers = call("scene.js", "groundHeight", *([scan.reshape(-1).tolist()] for scan in scans))
     for scan, answer in zip(scans, answers, strict=True):
         assert answer["result"] == pytest.approx(ground_height(scan[:, 2]), abs=1e-6)
+
+
+def test_lzf_by_hand() -> None:
+    answers = call("readers.js", "lzfDecompress", *([list(packed), len(expected)] for packed, expected in LZF_STREAMS))
+    assert [bytes(answer["result"]) for answer in answers] == [expected for _, expected in LZF_STREAMS]
 
 
 @pytest.mark.parametrize("encoding", ["ascii", "binary", "binary_compressed"])

@@ -41,6 +41,19 @@ def test_velocity_and_identity_of_an_oncoming_car() -> None:
     assert track.detection.x_m == 31.0 and track.vx_mps == tracks.velocities_mps[0, 0]
 
 
+def test_far_from_a_map_s_origin_velocities_are_as_exact_as_near_it() -> None:
+    """Poses of a map's coordinates have hundreds of kilometres, of which a float32 holds no more than centimetres."""
+    speeds = []
+    for origin in ((0.0, 0.0), (456_789.123, 5_432_109.876)):
+        tracker = Tracker()
+        for step in range(10):
+            moved = pose(origin[0] + 0.7 * step, origin[1] + 0.2 * step, 0.3)
+            tracks = tracker(found((30 - 0.3 * step, 2.0, 0.9, 0)), step / 10, moved)
+        speeds.append(tracks.velocities_mps)
+    assert np.abs(speeds[0]).max() > 1
+    np.testing.assert_allclose(speeds[1], speeds[0], atol=1e-4)
+
+
 def test_cars_that_pass_each_other_keep_their_identities() -> None:
     tracker = Tracker()
     for step in range(40):
@@ -55,6 +68,15 @@ def test_a_person_does_not_take_the_track_of_a_car() -> None:
     tracker = Tracker()
     tracker(found((10, 0, 0.9, 0)), 0.0)
     assert tracker(found((10, 0, 0.9, 1)), 0.1).track_ids.tolist() == [1]
+
+
+@pytest.mark.parametrize(("aside_m", "track_id"), [(0.6, 0), (0.9, 1)])
+def test_a_detection_beyond_the_gate_is_somebody_else(aside_m: float, track_id: int) -> None:
+    """Of one who stands still 99 % of the detections are within 0.8 m of where the last two seconds place him."""
+    tracker = Tracker()
+    for step in range(20):
+        tracker(found((10, 0, 0.9, 1)), step / 10)
+    assert tracker(found((10, aside_m, 0.9, 1)), 2.0).track_ids.tolist() == [track_id]
 
 
 def test_a_track_survives_a_gap_and_ends_after_a_longer_one() -> None:

@@ -5,13 +5,22 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tests.scans.scan_files import POINTS, pcd
+from tests.scans.scan_files import POINTS, literal_lzf, pcd
 
 XYZ = POINTS * np.array([1, 1, 1, 0], np.float32)
 _UNIT = np.array([1, 1, 1, 255], np.float32)
 BYTES = np.floor(POINTS * _UNIT)
 _BINARY, _ASCII, _PACKED = pcd("binary"), pcd("ascii"), pcd("binary_compressed")
 _BODY = _BINARY[_BINARY.index(b"DATA binary\n") + len(b"DATA binary\n") :]
+
+# What PCL packs the body of a binary_compressed file with, and what it unpacks to.
+LZF_STREAMS = [
+    (b"\x02abc" + b"\x20\x02", b"abcabc"),  # length 1 + 2, distance 2 + 1
+    (b"\x00a" + b"\xe0\x05\x00", b"a" * 15),  # length 7 + 5 + 2, distance 1: repeats its own output
+    (b"\x01ab" + b"\x60\x01" + b"\x00c", b"ab" + b"ababa" + b"c"),  # length 3 + 2, distance 2
+    (literal_lzf(b"a" + bytes(299)) + b"\x21\x2b", b"a" + bytes(299) + b"a\0\0"),  # distance 256 + 43 + 1: the start
+    (b"", b""),
+]
 
 
 class Case(NamedTuple):

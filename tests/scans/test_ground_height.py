@@ -6,6 +6,7 @@ from numpy.typing import NDArray
 
 from asca_pillars.base.errors import ScanError
 from asca_pillars.scans.ground_height import (
+    BAND_M,
     NamedPoints,
     estimate_height,
     estimate_named_height,
@@ -54,6 +55,18 @@ def test_the_height_is_estimated(height: float) -> None:
     assert estimate.height_m == pytest.approx(height, abs=0.03)
     assert estimate.spread_m < 0.05 and estimate.share > 0.8 and estimate.scans == 3
     assert f"{estimate.height_m:.2f} m" in str(estimate)
+
+
+@pytest.mark.parametrize(("deeper_m", "below"), [(1.5 * BAND_M, False), (3 * BAND_M, True)])
+def test_ruts_are_not_below_the_ground(deeper_m: float, below: bool) -> None:
+    """A quarter of the ground is lower; beyond twice the band it tells of a plane above the ground."""
+    rng = np.random.default_rng(0)
+    points = rng.uniform((-20, -20, -1.71), (20, 20, -1.69), (30_000, 3))
+    points[(points[:, 0] % 4 < 1), 2] -= deeper_m
+    plane = fit_ground_plane(points)
+    assert plane is not None and plane.height_m == pytest.approx(1.7, abs=0.02)
+    assert plane.share == pytest.approx(0.75, abs=0.02)
+    assert plane.share_below == pytest.approx(0.25 if below else 0.0, abs=0.02)
 
 
 def test_points_on_a_line_are_no_ground() -> None:

@@ -7,8 +7,8 @@ import pytest
 
 from asca_pillars.base.errors import ScanError
 from asca_pillars.scans.pcd import lzf_decompress
-from tests.scans.pcd_cases import READ, REFUSED
-from tests.scans.scan_files import literal_lzf, read
+from tests.scans.pcd_cases import LZF_STREAMS, READ, REFUSED
+from tests.scans.scan_files import read
 
 
 @pytest.mark.parametrize("case", READ, ids=lambda case: case.name)
@@ -28,16 +28,7 @@ def test_what_is_refused(tmp_path, case):
 # --- LZF
 
 
-@pytest.mark.parametrize(
-    ("stream", "expected"),
-    [
-        (b"\x02abc" + b"\x20\x02", b"abcabc"),  # length 1 + 2, distance 2 + 1
-        (b"\x00a" + b"\xe0\x05\x00", b"a" * 15),  # length 7 + 5 + 2, distance 1: repeats its own output
-        (b"\x01ab" + b"\x60\x01" + b"\x00c", b"ab" + b"ababa" + b"c"),  # length 3 + 2, distance 2
-        (literal_lzf(bytes(300)) + b"\x21\x2b", bytes(303)),  # distance 256 + 43 + 1 = 300: the very start
-        (b"", b""),
-    ],
-)
+@pytest.mark.parametrize(("stream", "expected"), LZF_STREAMS)
 def test_lzf_by_hand(stream, expected):
     assert lzf_decompress(stream, len(expected)) == expected
 

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from asca_pillars.base.errors import ScanError
 from asca_pillars.scans.find_scans import SCAN_SUFFIXES
-from asca_pillars.scans.scan_reader import read_scan, write_scan
+from asca_pillars.scans.scan_reader import decide_scale, read_scan, write_scan
 from tests.scans.scan_files import POINTS, npy, pcd, ply, read
 
 FILES = {
@@ -84,6 +84,13 @@ def test_integers_are_of_0_to_255_even_in_a_dark_scan(tmp_path):
     ):
         np.testing.assert_allclose(read(tmp_path, name, content).points[:, 3], 1 / 255)
     np.testing.assert_allclose(read(tmp_path, "f.pcd", pcd("ascii", dark)).points[:, 3], 1)
+
+
+@pytest.mark.parametrize(("large", "scale"), [(2, 1.0), (3, 255.0)])
+def test_one_value_in_a_thousand_may_be_too_large(large, scale):
+    values = np.full(2000, 0.5, np.float32)
+    values[:large] = 200
+    assert decide_scale(values) == (scale, True)
 
 
 def test_missing_reflectance_is_zero(tmp_path):

@@ -28,7 +28,7 @@ def labels_of(
     return label((Target("Car", box),), hits, np.zeros(points, np.int32), calibration, SceneConfig())
 
 
-@pytest.mark.parametrize(("visible", "state"), [(95, 0), (70, 1), (20, 2), (7, 3)])
+@pytest.mark.parametrize(("visible", "state"), [(95, 0), (83, 0), (82, 1), (70, 1), (36, 2), (20, 2), (9, 3), (7, 3)])
 def test_the_share_of_visible_rays_is_the_occlusion_state(visible: int, state: int) -> None:
     (label,) = labels_of(20.0, 0.0, 100, visible, 50)
     assert (label.type, label.occluded, label.truncated) == ("Car", state, 0.0)

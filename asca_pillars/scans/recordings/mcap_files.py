@@ -208,7 +208,8 @@ class McapRecording(Recording):
             if waiting and (not opened or (waiting[0].message_start_time <= opened[0][0] and held < _MAX_OPEN_BYTES)):
                 if (data := self._chunk_at(stream, waiting.popleft())) is None:
                     continue
-                number, messages, size = len(waiting), self._sorted(data, topic), len(data)
+                # Of equal times the chunk that was opened first goes first.
+                number, messages, size = -len(waiting), self._sorted(data, topic), len(data)
                 held += size
             else:
                 _, number, stored, messages, size = heapq.heappop(opened)

@@ -157,6 +157,15 @@ def test_what_is_behind_an_inserted_object_disappears() -> None:
     assert scene.frame_with_inserted(min_points=int(left) + 1).labels.tolist() == [IGNORED, 1, 2]
 
 
+def test_an_inserted_object_needs_as_many_points_as_a_labelled_one() -> None:
+    """Exactly so many are enough."""
+    scene = Scene(frame_of(cast(LEVEL, NO_BOXES), NO_BOXES, []), NO_BOXES)
+    item = scanned(stand("Car", 10, 0), label=2)
+    scene.add(item)
+    for more, label in ((0, 2), (1, IGNORED)):
+        assert scene.frame_with_inserted(min_points=len(item.points) + more).labels.tolist() == [label]
+
+
 def test_a_scan_drawn_with_the_object_in_it_is_what_insertion_gives() -> None:
     """Ground truth: cast the rays once more with the object standing there."""
     boxes = np.array([stand("Car", 18, 3, 0.4), stand("Pedestrian", 12, -3)])
@@ -182,6 +191,17 @@ def test_objects_do_not_hide_one_another() -> None:
         scene = Scene(empty, NO_BOXES)
         scene.add(scanned(first))
         assert not scene.keeps_all_visible(scanned(second)) and scene.keeps_all_visible(scanned(beside))
+
+
+def test_a_car_hides_the_edge_of_one_that_stands_beside_its_shadow() -> None:
+    near, far = scanned(stand("Car", 10, 0, np.pi / 2)), scanned(stand("Car", 20, 4.5, np.pi / 2))
+    left = int((~rays_entering(far.points, near.box[None])).sum())
+    assert 0 < left < len(far.points)
+    for items in ((far, near), (near, far)):
+        scene = Scene(frame_of(cast(LEVEL, NO_BOXES), NO_BOXES, []), NO_BOXES)
+        for item in items:
+            scene.add(item)
+        assert points_in_boxes(scene.frame_with_inserted(1).points, far.box[None]).sum() == left
 
 
 def test_inserted_objects_hide_each_other() -> None:

@@ -88,6 +88,16 @@ def test_two_walls_that_meet_do_not_take_the_yard() -> None:
     assert space.is_free(np.array([[20.0, 0.0], [25.0, -5.0]])).all()
 
 
+@pytest.mark.parametrize(("height_m", "free"), [(1.5, False), (4.0, True)])
+def test_under_branches_the_ground_is_free(height_m: float, free: bool) -> None:
+    """What hangs higher than a person or a car neither blocks a place nor is a cluster."""
+    x, y = (part.ravel() for part in np.meshgrid(np.arange(9, 12, 0.1), np.arange(-1, 1, 0.1)))
+    leaves = np.column_stack([x, y, np.full(x.size, LEVEL[2] + height_m), np.full(x.size, 0.3)]).astype(np.float32)
+    space = find_free_space(np.concatenate([cast(LEVEL, BOXES[:0]), leaves]))
+    assert space.is_free(np.array([[10.0, 0.0], [11.0, 0.5]])).tolist() == [free, free]
+    assert len(space.clusters) == (0 if free else 1)
+
+
 @pytest.mark.parametrize("points", [np.zeros((0, 4), np.float32), np.full((50, 4), 5, np.float32)])
 def test_nothing_is_free_without_ground(points: np.ndarray) -> None:
     space = find_free_space(points)

@@ -18,7 +18,7 @@ from asca_pillars.scans.recordings import decompression, mcap_files
 from asca_pillars.scans.recordings.open_recording import open_recording
 from asca_pillars.scans.recordings.recorded_scans import RecordedScans
 from asca_pillars.scans.recordings.recording import Recording, Topic
-from tests.scans.recordings.cloud_recordings import CLOUD, cloud_points, clouds, stamps, store, write_mcap
+from tests.scans.recordings.cloud_recordings import CLOUD, START_NS, cloud_points, clouds, stamps, store, write_mcap
 from tests.scans.recordings.decompression_bombs import zstd_zeros
 
 WRITERS: dict[str, dict[str, Any]] = {
@@ -60,6 +60,14 @@ def test_messages_of_chunks_that_overlap_come_by_time(tmp_path: Path, monkeypatc
     assert times(recording) == stamps(12)
     monkeypatch.setattr(mcap_files, "_MAX_OPEN_BYTES", 1)
     assert sorted(map(int, filter(None, times(recording)))) == stamps(12), "none is lost where memory is not enough"
+
+
+def test_messages_of_one_time_come_in_the_order_of_the_file(tmp_path: Path) -> None:
+    """As the library reads them, whether in one chunk or in several."""
+    messages = [(START_NS + time_ns, bytes([number]) * 1500) for number, time_ns in enumerate((1, 2, 2, 2, 2, 3))]
+    for chunk_size in (1000, 4000):  # one message in each, or three
+        recording = open_recording(write_mcap(tmp_path / "a.mcap", {"/lidar": messages}, chunk_size=chunk_size))
+        assert [one.data[0] for one in recording.messages("/lidar")] == [0, 1, 2, 3, 4, 5]
 
 
 def test_a_topic_without_a_schema_can_be_named(tmp_path: Path) -> None:

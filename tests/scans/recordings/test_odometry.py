@@ -49,6 +49,21 @@ def test_a_car_that_leans_is_turned_about_every_axis(tmp_path: Path) -> None:
         np.testing.assert_allclose(found, between(share).as_matrix(), atol=1e-9)
 
 
+def test_a_quaternion_and_its_opposite_are_the_same_turn(tmp_path: Path) -> None:
+    """From the second pose on the sender gives the other sign, and keeps it."""
+    yaws, messages = (0.1, 0.3, 0.5, 0.7), []
+    for i, yaw in enumerate(yaws):
+        message = odometry_message(START_NS + i * SECOND, 0.0, yaw)
+        if i:
+            turn = message.pose.pose.orientation
+            turn.z, turn.w = -turn.z, -turn.w
+        messages.append((START_NS + i * SECOND, message))
+    poses = read_poses(open_recording(write_mcap(tmp_path / "a.mcap", {}, odometry=messages)), "/odom")
+    for i in range(len(yaws) - 1):
+        matrix, yaw = poses.at(START_NS + i * SECOND + SECOND // 2), (yaws[i] + yaws[i + 1]) / 2
+        assert matrix[:2, 0] == pytest.approx([np.cos(yaw), np.sin(yaw)], abs=1e-6)
+
+
 def test_one_pose_is_enough(tmp_path: Path) -> None:
     recording = open_recording(
         write_mcap(tmp_path / "a.mcap", {}, odometry=[(START_NS, odometry_message(START_NS, 4.0))])

@@ -5,6 +5,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from asca_pillars.geometry.boxes import corners
 from asca_pillars.sim.bodies.cycles import motorbike_body, parked_bicycle_body
 from asca_pillars.sim.bodies.primitives import Primitives, cuboids, ellipsoids, limbs, prisms
 from asca_pillars.sim.bodies.styles import HATCHBACK, Profile, draw_style
@@ -75,6 +76,13 @@ def test_placing_turns_and_moves_every_kind_of_primitive() -> None:
     point = body.centers[0] + np.linalg.inv(body.unit_from_world[0]) @ np.array([0.6, 0.0, 0.8])
     moved = turn @ point + (3.0, -2.0, 0.5)
     assert np.linalg.norm(placed.unit_from_world[0] @ (moved - placed.centers[0])) == pytest.approx(1.0)
+
+
+def test_a_turned_cuboid_is_the_box_of_its_numbers() -> None:
+    box = np.array([1.0, -2.0, 0.75, 4.0, 1.6, 1.5, 0.4])
+    body = cuboids([(*box[:2], box[2] - box[5] / 2, *box[3:], 0.5, 0.0, 0.0)])
+    found = np.unique(np.round(body.triangles.reshape(-1, 3), 9), axis=0)
+    np.testing.assert_allclose(found, np.unique(np.round(corners(box[None])[0], 9), axis=0))
 
 
 def test_limbs_reach_from_joint_to_joint() -> None:

@@ -112,6 +112,21 @@ def test_a_solid_ellipsoid_is_hit_where_its_equation_says(firings: Firings) -> N
     assert (nearest[~met] > 1 - 1e-9).all()
 
 
+def test_a_slope_around_the_sensor_is_not_hit_behind_it(firings: Firings) -> None:
+    """A slanted triangle below and above the sensor spans every azimuth; a line meets its plane once, one way."""
+    slope, height = 0.3, -1.5  # z = slope * x + height
+    corners = np.array([(-80.0, -90.0), (90.0, 0.0), (-80.0, 90.0)])
+    triangle = quads([[(x, y, slope * x + height) for x, y in (*corners, corners[0])]], Surface(0.5))
+    rho = cast(bodies(triangle), 0, None, firings, seed=0).rho_m
+    rays = directions(firings)
+    with np.errstate(divide="ignore"):
+        expected = (height - firings.origin_z_m[:, None]) / (rays[..., 2] - slope * rays[..., 0])
+    ahead = (expected > 0) & (expected < 40)
+    assert ahead.mean() > 0.2 and (expected < 0).mean() > 0.2
+    np.testing.assert_allclose(rho[ahead], expected[ahead], rtol=1e-6)
+    assert np.isinf(rho[expected < 0]).all()
+
+
 def test_a_cloud_lets_an_exponential_share_through(firings: Firings) -> None:
     """A slab of optical depth 1 (density 0.5 per metre, 2 m thick at its middle) stops 1 - 1/e of the rays."""
     cloud = ellipsoids([(10.0, 0.0, -1.0)], [(1.0, 40.0, 40.0)], np.array([[0.5, 0.0, 0.5]]))

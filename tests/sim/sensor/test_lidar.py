@@ -94,6 +94,16 @@ def test_two_stacked_sensors_are_one_list_of_lasers() -> None:
     assert (measured[upper].max(), measured[upper].min()) == pytest.approx((15.0, -25.0), abs=0.1)
 
 
+def test_a_laser_above_another_takes_its_origin_along() -> None:
+    """Of two that hardly differ the lower one is adjusted higher in some scans."""
+    lidar = Lidar(
+        elevation_deg=(0.01, 0.0), origin_z_m=((0.0, 0.0), (-1.0, -1.0)), elevation_jitter_deg=1.0, ring_gain=()
+    )
+    drawn = [draw_firings(lidar, np.random.default_rng(seed), camera_only=True) for seed in range(20)]
+    assert all((np.diff(firings.slope) < 0).all() for firings in drawn)
+    assert {tuple(firings.origin_z_m) for firings in drawn} == {(0.0, -1.0), (-1.0, 0.0)}
+
+
 def test_the_sensor_of_kitti_has_its_pattern_and_its_car() -> None:
     firings = draw_firings(Lidar(), np.random.default_rng(1), camera_only=False)
     step = np.rad2deg(np.diff(firings.azimuth_rad))
