@@ -52,6 +52,18 @@ class SaveOnInterrupt(Checkpoint):
             for number, handler in self._before.items():
                 signal.signal(number, handler)
 
+    def on_sanity_check_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """As `on_train_start`."""
+        self._replace_lightnings_handlers()
+
+    def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Take over the signals from Lightning, which has put its handler before ours.
+
+        Its handler of SIGTERM broadcasts to the other ranks at once: in the middle of a backward pass, whose gradients
+        they wait for, none of them ever goes on.
+        """
+        self._replace_lightnings_handlers()
+
     def on_train_batch_end(self, trainer: L.Trainer, pl_module: L.LightningModule, *_: Any) -> None:
         """Save and stop, on all ranks together."""
         if self._any_rank_requested_stop(trainer):
@@ -62,6 +74,11 @@ class SaveOnInterrupt(Checkpoint):
         """Stop: the epoch was saved before its validation."""
         if not trainer.sanity_checking and self._any_rank_requested_stop(trainer):
             self._stop(trainer)
+
+    def _replace_lightnings_handlers(self) -> None:
+        if not self.stop_requested:
+            for number in self._before:
+                signal.signal(number, self._request_stop)
 
     def _request_stop(self, number: int, *_: Any) -> None:
         self.stop_requested = True
