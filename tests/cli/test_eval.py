@@ -122,7 +122,7 @@ def test_the_shipped_bundle_and_its_predictions_score_the_same(
     for path in (root / "training" / "velodyne").iterdir():
         write_scan(path, read_scan(path).points * np.array([1, 1, 1, 0.1], np.float32))  # darker than any street
     report = evaluate(data=root, out=out, gallery=1)
-    assert "asca_sim_int8 on" in report["subject"] and report["frames"] == 2
+    assert "default on" in report["subject"] and report["frames"] == 2
     assert report["model"]["min_score"] == 0.05 and len(report["model"]["sha256"]["encoder"]) == 64
     own = {spec.name: spec.score_threshold for spec in load_pillar_bundle(default_bundle_path()).spec.classes}
     assert {point["class_name"]: point["score"] for point in report["operating_points"]} == own
@@ -131,7 +131,7 @@ def test_the_shipped_bundle_and_its_predictions_score_the_same(
     lines = "".join((out / "predictions" / f"00000{frame}.txt").read_text() for frame in (1, 2)).splitlines()
     assert lines and all(float(line.split()[15]) >= 0.05 for line in lines)
     assert len(list((out / "gallery").glob("*.png"))) == 1
-    assert "2 of 2 scans are unlike those that asca_sim_int8 was trained on" in capsys.readouterr().out
+    assert "2 of 2 scans are unlike those that default was trained on" in capsys.readouterr().out
     assert json.loads((out / "predictions" / "made_by.json").read_text())["scores"] == own
     again = evaluate(predictions=out / "predictions", data=root, out=tmp_path / "again")
     for key in ("results", "bands", "best_scores"):  # text has no thresholds of its own
@@ -199,7 +199,7 @@ def test_arguments_that_do_not_go_together(tmp_path: Path, root: Path, texts: di
         "--split val is a list of the frames of a dataset: give --data ROOT, too"
     )
     assert refusal(tmp_path, data=root, score=["0.04"]) == (
-        "score 0.04 of Car is below --min-score 0.05, the lowest that asca_sim_int8 is run with; lower --min-score"
+        "score 0.04 of Car is below --min-score 0.05, the lowest that default is run with; lower --min-score"
     )
     assert "bundle.json" in refusal(tmp_path, model=tmp_path, data=root)
     assert "velodyne" in refusal(tmp_path, data=tmp_path)

@@ -71,9 +71,9 @@ def test_boxes_without_a_camera(tmp_path: Path) -> None:
 def test_the_model_that_wrote_the_predictions_is_named(root: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     invoke("eval", "--data", root, "--errors", "--out", out)
-    assert list(datasets(out)) == ["asca_sim_int8 kitti/val"]
+    assert list(datasets(out)) == ["default kitti/val"]
     invoke("eval", "--data", root, "--predictions", out / "predictions", "--errors", "--out", tmp_path / "again")
-    assert list(datasets(tmp_path / "again")) == ["asca_sim_int8 kitti/val"]
+    assert list(datasets(tmp_path / "again")) == ["default kitti/val"]
 
 
 @pytest.mark.parametrize(

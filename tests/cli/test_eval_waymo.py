@@ -34,7 +34,7 @@ def test_waymos_metric_of_labels_against_themselves(
 
 def test_waymos_metric_of_the_shipped_bundle(tmp_path: Path, root: Path) -> None:
     report = evaluate(data=root, out=tmp_path / "out", protocol="waymo")
-    assert "asca_sim_int8 on" in report["subject"] and report["model"]["min_score"] == 0.05
+    assert "default on" in report["subject"] and report["model"]["min_score"] == 0.05
     assert len(list((tmp_path / "out" / "predictions").glob("*.txt"))) == 2
     again = evaluate(predictions=tmp_path / "out" / "predictions", data=root, out=tmp_path / "again", protocol="waymo")
     assert again["results"] == report["results"]

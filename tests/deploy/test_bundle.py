@@ -50,6 +50,7 @@ def test_weights_lie_in_some_bundles(tiny_bundle: Path, tmp_path: Path, monkeypa
 
 def test_shipped_files_lie_in_the_package() -> None:
     assert default_bundle_path().parts[-3:] == ("asca_deploy", "bundles", "default")
+    assert [load_bundle(folder).name for folder in shipped_bundles().values()] == [*shipped_bundles()]
     assert [*shipped_bundles()] == ["accurate", "default", "default_float32", "fast"]
     assert find_weights("default") == find_weights("default_float32")
     assert find_weights("pvrcnn_small_sim").is_file()

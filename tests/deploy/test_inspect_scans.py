@@ -99,10 +99,10 @@ def test_what_is_printed_and_written(folder: Path) -> None:
     assert "2 of 3 scans measured" in output and "--around" in output
     written = json.loads(report.read_text())
     assert written["inspected"] == 2 and written["findings"] and written["expected"]["camera_view"] is True
-    assert written["height"]["scans"] == 2 and written["model"] == "asca_sim_int8"
+    assert written["height"]["scans"] == 2 and written["model"] == "default"
     write_scan(folder / "own" / "1.bin", POINTS[POINTS[:, 0] > 0])
     output = invoke("inspect", folder / "own" / "1.bin", "--bundle", "fast")
-    assert "against asca_small_sparse_sim_int8" in output and output.endswith("Nothing to warn of.\n")
+    assert "against fast" in output and output.endswith("Nothing to warn of.\n")
 
 
 def test_options_that_do_not_go_together(folder: Path) -> None:
