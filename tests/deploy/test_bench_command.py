@@ -118,9 +118,10 @@ def test_a_scan_with_nothing_to_compute_has_no_roofline(tiny_bundle: Path, tmp_p
     assert "roofline" not in json.loads((tmp_path / "report.json").read_text())
 
 
-def test_a_bundle_that_ships_goes_by_its_name(tiny_bundle: Path) -> None:
+@pytest.mark.parametrize("name", ["default", "asca_sim_int8"])
+def test_a_bundle_that_ships_goes_by_its_name(name: str) -> None:
     with pytest.raises(ConfigError, match="compared with itself"):
-        CliRunner().invoke(app, ["bench", "--compare", "fast"], catch_exceptions=False)
+        CliRunner().invoke(app, ["bench", "--compare", name], catch_exceptions=False)
 
 
 def test_of_many_scans_some_are_timed(
