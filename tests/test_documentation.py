@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.helpers.blank_plots import blank_plots
 from tests.helpers.documentation import DOCS, Block, blocks, help_of, run, write_files
 
 PAGES = {str(page.relative_to(DOCS)): page for page in sorted(DOCS.rglob("*.md"))}
@@ -47,7 +48,7 @@ def test_every_block_runs(name: str, files: Path, tmp_path: Path, monkeypatch: p
     for folder in MADE_HERE.get(name, ()):
         shutil.rmtree(tmp_path / folder)
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("matplotlib.figure.Figure.draw", lambda figure, renderer: None)  # a second each
+    blank_plots(monkeypatch)
     logging.getLogger("asca_pillars").setLevel(logging.ERROR)
     for block in runs(name):
         run(block, name)

@@ -38,13 +38,11 @@ def average_weights(
     from rich.console import Console
 
     from asca_deploy.shipped import find_checkpoint
-    from asca_pillars.base.errors import ConfigError, OutputError
+    from asca_pillars.base.errors import ConfigError
     from asca_pillars.models.average import average_checkpoints
+    from asca_pillars.models.checkpoint_file import require_new_checkpoint
 
-    if out.suffix != ".ckpt":
-        raise OutputError(f"{out}: give a name that ends in .ckpt, by which the other commands know a checkpoint")
-    if out.exists():
-        raise OutputError(f"{out}: is there already, and a training may need it; choose another name, or remove it")
+    require_new_checkpoint(out)
     try:
         given = None if shares is None else [float(share) for share in shares.split(",")]
     except ValueError:

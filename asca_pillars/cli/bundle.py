@@ -9,7 +9,7 @@ app = typer.Typer(help="List, describe and verify model bundles.", no_args_is_he
 
 _BundleArgument = Annotated[
     Path | None,
-    typer.Argument(help="Folder of a bundle, or the name of one that comes with asca. Default: default."),
+    typer.Argument(help="Folder of a bundle, or the name of one that comes with asca. Without it: default."),
 ]
 _AsJson = Annotated[bool, typer.Option("--json", help="Print JSON instead, for programs.")]
 

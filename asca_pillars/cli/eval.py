@@ -17,7 +17,7 @@ from asca_pillars.cli.options import (
 def evaluate(
     model: Annotated[
         Path | None,
-        typer.Argument(help="Bundle (folder, or name of one that ships) or checkpoint (.ckpt). Default: default."),
+        typer.Argument(help="Bundle (folder, or name of one that ships) or checkpoint (.ckpt). Without it: default."),
     ] = None,
     *,
     data: Annotated[

@@ -48,14 +48,11 @@ def import_weights(
     require("train")
     from rich.console import Console
 
-    from asca_pillars.base.errors import OutputError
     from asca_pillars.config.tree import load_config
+    from asca_pillars.models.checkpoint_file import require_new_checkpoint
     from asca_pillars.models.openpcdet.import_checkpoint import published_config, read_foreign, write_imported
 
-    if out.suffix != ".ckpt":
-        raise OutputError(f"{out}: give a name that ends in .ckpt, by which the other commands know a checkpoint")
-    if out.exists():
-        raise OutputError(f"{out}: is there already, and a training may need it; choose another name, or remove it")
+    require_new_checkpoint(out)
     weights = read_foreign(file)
     name = str(config or published_config(weights))
     count = write_imported(weights, load_config(name, override or []), out)

@@ -28,7 +28,7 @@ BundleOption = Annotated[
         "--bundle",
         "-b",
         help="Model bundle: a folder, or the name of one that comes with asca: default, fast (half as wide), accurate "
-        "(with a second stage), all in 8 bits, or default_float32. Default: default.",
+        "(with a second stage), all in 8 bits, or default_float32. Without it: default.",
         rich_help_panel="Input",
     ),
 ]

@@ -3,12 +3,11 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-import torch
 from torch import Tensor
 
-from asca_pillars.base.errors import ConfigError, TrainingError
-from asca_pillars.base.files import atomic_path
-from asca_pillars.models.checkpoint_file import CheckpointFile, read_checkpoint, read_plain
+from asca_pillars.base.errors import ConfigError
+from asca_pillars.base.schema import to_dict
+from asca_pillars.models.checkpoint_file import read_checkpoint, require_same_arrays, write_plain
 
 
 def average_checkpoints(paths: Sequence[str | Path], out: str | Path, shares: Sequence[float] | None = None) -> None:
@@ -37,19 +36,23 @@ def average_checkpoints(paths: Sequence[str | Path], out: str | Path, shares: Se
         )
     files = [read_checkpoint(path) for path in paths]
     for file in files[1:]:
-        _require_same_arrays(files[0], file)
+        remedy = "average checkpoints of one network"
+        require_same_arrays(file.weights, files[0].weights, file.path, str(files[0].path), remedy)
     averaged = {
         name: _mean([file.weights[name] for file in files], [share / sum(given) for share in given])
         for name in files[0].weights
     }
-    first = read_plain(files[0].path)
+    expected_input = files[0].expected_input
+    about = {
+        "config": to_dict(files[0].config),
+        "expected_input": None if expected_input is None else to_dict(expected_input),
+    }
     content = {
-        "hyper_parameters": first["hyper_parameters"],
+        "hyper_parameters": about,
         "global_step": files[0].steps,
         "state_dict": {f"detector.{name}": value for name, value in averaged.items()},
     }
-    with atomic_path(out) as temporary, temporary.open("wb") as written:  # see `AtomicCheckpointIO`
-        torch.save(content, written)
+    write_plain(content, out)
 
 
 def _mean(values: Sequence[Tensor], shares: Sequence[float]) -> Tensor:
@@ -59,13 +62,3 @@ def _mean(values: Sequence[Tensor], shares: Sequence[float]) -> Tensor:
     total = sum(share * value.double() for share, value in zip(shares, values, strict=True))
     assert isinstance(total, Tensor)
     return total.float()
-
-
-def _require_same_arrays(first: CheckpointFile, other: CheckpointFile) -> None:
-    for name in first.weights | other.weights:
-        shapes = [tuple(file.weights[name].shape) if name in file.weights else "missing" for file in (first, other)]
-        if shapes[0] != shapes[1]:
-            raise TrainingError(
-                f"{other.path}: weights of another network: {name} is {shapes[1]} there and {shapes[0]} in "
-                f"{first.path}; average checkpoints of one network"
-            )

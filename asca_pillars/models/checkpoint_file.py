@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from asca_pillars.base.errors import ConfigError, TrainingError
-from asca_pillars.base.files import atomic_path
+from asca_pillars.base.errors import ConfigError, OutputError, TrainingError
+from asca_pillars.base.files import WEIGHTS_FILE, atomic_path
 from asca_pillars.base.input_files import require_content
 from asca_pillars.base.schema import parse
 from asca_pillars.config.tree import Config
@@ -128,9 +128,45 @@ def save_weights(checkpoint: Path, path: Path) -> None:
             for name, value in content["state_dict"].items()
         },
     }
+    write_plain(content, path)
+
+
+def write_plain(content: Mapping[str, Any], path: str | Path) -> None:
+    """Write a dictionary of plain values and tensors, which `read_plain` reads."""
     # Opened here: torch writes the name of a file that it opens into it, and these are temporary.
     with atomic_path(path) as temporary, temporary.open("wb") as file:
-        torch.save(content, file)
+        torch.save(dict(content), file)
+
+
+def require_new_checkpoint(path: Path) -> None:
+    """Raise OutputError if a checkpoint cannot be written to `path`: its name is no checkpoint's, or it exists."""
+    if path.suffix != Path(WEIGHTS_FILE).suffix:
+        raise OutputError(f"{path}: give a name that ends in .ckpt, by which the other commands know a checkpoint")
+    if path.exists():
+        raise OutputError(f"{path}: is there already, and a training may need it; choose another name, or remove it")
+
+
+def require_same_arrays(
+    found: Mapping[str, Tensor], expected: Mapping[str, Tensor], path: str | Path, expected_in: str, remedy: str
+) -> None:
+    """Compare names and shapes of the arrays of two networks.
+
+    Args:
+        found: of the checkpoint at `path`.
+        expected: of the other network.
+        path: for the error's text.
+        expected_in: where the other network stands, such as "this configuration".
+        remedy: end of the error's text.
+
+    Raises:
+        TrainingError: they differ; names the first array that does.
+    """
+    for name in {**expected, **found}:
+        theirs, ours = (tuple(each[name].shape) if name in each else "missing" for each in (found, expected))
+        if theirs != ours:
+            raise TrainingError(
+                f"{path}: weights of another network: {name} is {theirs} there and {ours} in {expected_in}; {remedy}"
+            )
 
 
 def weights_sha256(weights: Mapping[str, Tensor]) -> str:

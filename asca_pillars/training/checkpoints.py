@@ -19,7 +19,7 @@ from asca_pillars.config.pv_rcnn import PvRcnnModel
 from asca_pillars.config.tree import Config, ModelConfig
 from asca_pillars.models.build import build_model
 from asca_pillars.models.checkpoint import load_checkpoint
-from asca_pillars.models.checkpoint_file import read_failure, read_plain
+from asca_pillars.models.checkpoint_file import read_failure, read_plain, require_same_arrays
 
 LAST, PREVIOUS, BEST = "last.ckpt", "previous.ckpt", "best.ckpt"
 _UNREADABLE = (OSError, RuntimeError, ValueError, EOFError, KeyError, pickle.UnpicklingError, zipfile.BadZipFile)
@@ -191,11 +191,6 @@ def initial_weights(config: Config, init: Path | None) -> dict[str, Any]:
         {name: array for name, array in weights.items() if not alone or name.startswith(_FIRST_STAGE)}
         for weights in (load_checkpoint(init).detector.state_dict(), build_model(config.model).state_dict())
     )
-    for name in ours | theirs:
-        found, expected = (tuple(each[name].shape) if name in each else "missing" for each in (theirs, ours))
-        if found != expected:
-            raise TrainingError(
-                f"{init}: weights of another network: {name} is {found} there and {expected} in this configuration; "
-                "model.spec and model.network have to be like those that it was trained with"
-            )
+    remedy = "model.spec and model.network have to be like those that it was trained with"
+    require_same_arrays(theirs, ours, init, "this configuration", remedy)
     return theirs

@@ -173,7 +173,7 @@ class Quantization(Strict):
 
     calibration_scans: int
     dropped_scans: int | None
-    """Scans left out of the calibration because they are among the compared ones; None where nobody counted them."""
+    """Scans left out of the calibration because they are among the compared ones; None in older bundles."""
     compared_scans: int
     layers: tuple[LayerQuantization, ...]
     logit_rms_error: float

@@ -7,19 +7,20 @@ import pytest
 
 from asca_pillars.data.kitti import KittiObject, KittiSplit, write_labels
 from tests.cli.short_drive import write_drive
+from tests.helpers.blank_plots import blank_plots
 from tests.helpers.scenes import write_dataset
 
 
 @pytest.fixture
 def drawn_plots() -> None:
-    """Of tests that look at a plot."""
+    """Tests that use this fixture look at a plot, which is really drawn."""
 
 
 @pytest.fixture(autouse=True)
 def _blank_plots(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     """Plots are files with nothing on them: to draw one takes a second, and is tested where they are made."""
     if "drawn_plots" not in request.fixturenames:
-        monkeypatch.setattr("matplotlib.figure.Figure.draw", lambda figure, renderer: None)
+        blank_plots(monkeypatch)
 
 
 @pytest.fixture

@@ -35,7 +35,7 @@ by_backend = pytest.mark.parametrize("backend", BACKENDS)
 def maps_and_boxes(
     precision: str | None, bundle: Path = DENSE_FLOAT32
 ) -> tuple[HeadMaps[NDArray[np.float32]], Detections, Detector]:
-    """Of the sample scan by a bundle, in OpenVINO; None for the stock CPU."""
+    """Run a bundle on the sample scan, in OpenVINO with this precision or, with None, in onnxruntime."""
     where = {} if precision is None else {"provider": "openvino", "precision": precision}
     detector = Detector(bundle, **where)  # type: ignore[arg-type]
     pipeline = detector.pipeline

@@ -72,7 +72,7 @@ def test_a_person_does_not_take_the_track_of_a_car() -> None:
 
 @pytest.mark.parametrize(("aside_m", "track_id"), [(0.6, 0), (0.9, 1)])
 def test_a_detection_beyond_the_gate_is_somebody_else(aside_m: float, track_id: int) -> None:
-    """Of one who stands still 99 % of the detections are within 0.8 m of where the last two seconds place him."""
+    """A person stands still: 99 % of the detections are within 0.8 m of what the last two seconds predict."""
     tracker = Tracker()
     for step in range(20):
         tracker(found((10, 0, 0.9, 1)), step / 10)

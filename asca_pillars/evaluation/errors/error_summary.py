@@ -101,7 +101,7 @@ def _interval(drawn: _Doubles) -> tuple[float, float]:
 
 
 FALSE_RATES = (0.05, 0.1, 0.2, 0.3, 0.5)
-"""False detections a frame that score thresholds are given for."""
+"""Numbers of false detections per frame for which a score threshold is reported."""
 CLEAR_RANGE_M = 35.0
 CLEAR_TRUNCATION = 0.1
 SIDE_ON_DEG = 90.0 - END_ON_DEG
@@ -179,12 +179,12 @@ class FalseDetections(Strict):
 
 @dataclass(frozen=True)
 class FalseRate(Strict):
-    """The lowest score threshold with at most so many false detections a frame.
+    """The lowest score threshold that keeps a number of false detections per frame.
 
     Attributes:
-        per_frame: false detections a frame that are allowed.
+        per_frame: largest number of false detections per frame.
         score: threshold.
-        recall: share of the counted objects that are found from it on.
+        recall: share of the counted objects that are found at this threshold.
     """
 
     per_frame: float
@@ -199,7 +199,7 @@ class ClassErrors(Strict):
     Attributes:
         score: score threshold.
         best_score: the score with the best F1 at the BEV IoU of a found object; None without a found object.
-        false_rates: of each of FALSE_RATES, without those that no score reaches.
+        false_rates: one for each of FALSE_RATES that some score keeps.
         iou_3d: 3D IoU for `reaching`: KITTI's of the class, OTHER_IOU_3D for any other.
         boxes: boxes on counted objects, found or inaccurate.
         reaching: share of them that reach it as predicted, and with each of CORRECTIONS or WITHOUT_MEDIANS.

@@ -153,8 +153,8 @@ def _false_rate_table(datasets: Sequence[DatasetErrors], names: Sequence[str]) -
                     for each in FALSE_RATES
                 ]
                 rows.append((name, data.name, *cells))
-    title = "Lowest score with at most so many false detections a frame (share of the objects found)"
-    return TextTable(title, ("class", "dataset", *(f"{rate:g} a frame" for rate in FALSE_RATES)), tuple(rows))
+    title = "Lowest score threshold with at most so many false detections per frame (recall at it)"
+    return TextTable(title, ("class", "dataset", *(f"{rate:g} per frame" for rate in FALSE_RATES)), tuple(rows))
 
 
 def _background_table(datasets: Sequence[DatasetErrors], names: Sequence[str]) -> TextTable:

@@ -9,14 +9,13 @@ import torch
 from torch import Tensor
 
 from asca_pillars.base.errors import ConfigError, TrainingError
-from asca_pillars.base.files import atomic_path
 from asca_pillars.base.input_files import require_content
 from asca_pillars.base.schema import to_dict
 from asca_pillars.config.pillar import PillarModel
 from asca_pillars.config.pv_rcnn import PvRcnnModel
 from asca_pillars.config.tree import Config
 from asca_pillars.models.build import build_model
-from asca_pillars.models.checkpoint_file import read_failure, read_plain
+from asca_pillars.models.checkpoint_file import read_failure, read_plain, write_plain
 from asca_pillars.models.openpcdet.key_mapping import KeyMapping, convert_state
 from asca_pillars.models.openpcdet.mmdetection3d_keys import FIRST_LINEAR, FUSION, mmdetection3d_keys
 from asca_pillars.models.openpcdet.pointpillars_keys import pointpillars_keys
@@ -155,8 +154,7 @@ def write_imported(weights: ForeignWeights, config: Config, out: str | Path) -> 
         "global_step": weights.steps,
         "state_dict": {f"detector.{prefix}{name}": value for name, value in converted.items()},
     }
-    with atomic_path(out) as temporary, temporary.open("wb") as file:  # see `AtomicCheckpointIO`
-        torch.save(content, file)
+    write_plain(content, out)
     return len(weights.state)
 
 

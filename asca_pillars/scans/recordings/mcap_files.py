@@ -208,7 +208,7 @@ class McapRecording(Recording):
             if waiting and (not opened or (waiting[0].message_start_time <= opened[0][0] and held < _MAX_OPEN_BYTES)):
                 if (data := self._chunk_at(stream, waiting.popleft())) is None:
                     continue
-                # Of equal times the chunk that was opened first goes first.
+                # Messages of equal times are returned in the order of their chunks in the file.
                 number, messages, size = -len(waiting), self._sorted(data, topic), len(data)
                 held += size
             else:

@@ -90,7 +90,7 @@ def test_two_walls_that_meet_do_not_take_the_yard() -> None:
 
 @pytest.mark.parametrize(("height_m", "free"), [(1.5, False), (4.0, True)])
 def test_under_branches_the_ground_is_free(height_m: float, free: bool) -> None:
-    """What hangs higher than a person or a car neither blocks a place nor is a cluster."""
+    """Branches above the height of people and cars neither block a place nor form a cluster."""
     x, y = (part.ravel() for part in np.meshgrid(np.arange(9, 12, 0.1), np.arange(-1, 1, 0.1)))
     leaves = np.column_stack([x, y, np.full(x.size, LEVEL[2] + height_m), np.full(x.size, 0.3)]).astype(np.float32)
     space = find_free_space(np.concatenate([cast(LEVEL, BOXES[:0]), leaves]))

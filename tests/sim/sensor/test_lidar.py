@@ -95,7 +95,7 @@ def test_two_stacked_sensors_are_one_list_of_lasers() -> None:
 
 
 def test_a_laser_above_another_takes_its_origin_along() -> None:
-    """Of two that hardly differ the lower one is adjusted higher in some scans."""
+    """Two lasers have almost the same elevation, and in some scans the lower one is adjusted above the other."""
     lidar = Lidar(
         elevation_deg=(0.01, 0.0), origin_z_m=((0.0, 0.0), (-1.0, -1.0)), elevation_jitter_deg=1.0, ring_gain=()
     )
