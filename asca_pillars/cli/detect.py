@@ -9,7 +9,6 @@ import typer
 
 from asca_pillars.base.errors import ConfigError, PartialError
 from asca_pillars.cli.options import (
-    AroundOption,
     AxesOption,
     BundleOption,
     ClusterOption,
@@ -25,6 +24,7 @@ from asca_pillars.cli.options import (
     TopicOption,
     VideoOption,
     VideoViewOption,
+    ViewOption,
     read_scores,
     scan_settings,
 )
@@ -45,7 +45,7 @@ def detect(
     scans: ScansOrRecordingArgument = None,
     *,
     bundle: BundleOption = None,
-    around: AroundOption = False,
+    around: ViewOption = None,
     sensor_height: SensorHeightOption = None,
     axes: AxesOption = "x-forward",
     pose: PoseOption = None,
@@ -175,7 +175,7 @@ def detect(
 
     asca detect my_scans/ --score Car=0.6 --score Pedestrian=0.4
 
-    asca detect sweeps/ --around --axes y-forward --sensor-height auto
+    asca detect sweeps/ --axes y-forward --sensor-height auto
 
     asca detect drive.mcap --track --foxglove boxes.mcap
 

@@ -5,7 +5,6 @@ from typing import Annotated
 import typer
 
 from asca_pillars.cli.options import (
-    AroundOption,
     AxesOption,
     BundleOption,
     ColumnsOption,
@@ -17,6 +16,7 @@ from asca_pillars.cli.options import (
     ScoreOption,
     SensorHeightOption,
     ThreadsOption,
+    ViewOption,
     read_scores,
     scan_settings,
 )
@@ -26,7 +26,7 @@ def view(
     scans: ScansArgument = None,
     *,
     bundle: BundleOption = None,
-    around: AroundOption = False,
+    around: ViewOption = None,
     sensor_height: SensorHeightOption = None,
     axes: AxesOption = "x-forward",
     pose: PoseOption = None,
@@ -61,7 +61,7 @@ def view(
 
     asca view my_scans/
 
-    asca view sweeps/ --around --axes y-forward --sensor-height auto
+    asca view sweeps/ --axes y-forward --sensor-height auto
 
     asca view scan.pcd --port 8000 --no-browser
     """

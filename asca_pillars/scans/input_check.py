@@ -137,10 +137,20 @@ def _height_warning(ground: float | None, expected: ExpectedInput, mounting: Mou
     return InputWarning("height", text)
 
 
+def share_behind(points: Singles, model_ranges: Ranges) -> float:
+    """Return the share of the points (N, >=2), metres, LiDAR frame, in directions that the model does not cover.
+
+    It is 0 below BEHIND_SHARE and for a sensor that looks to one side, whose scans need no look around.
+    """
+    away = points[np.abs(points[:, :2]).max(axis=1, initial=0) > BODY_M]
+    share = float(model_ranges.behind(away).mean()) if len(away) else 0.0
+    one_sided = share >= BEHIND_SHARE and np.hypot(*_mean_direction(*away[:, :2].T)) >= _SECTOR_LENGTH
+    return 0.0 if share < BEHIND_SHARE or one_sided else share
+
+
 def _behind_warning(points: Singles, model_ranges: Ranges) -> InputWarning | None:
-    away = points[np.abs(points[:, :2]).max(axis=1) > BODY_M]
-    share = model_ranges.behind(away).mean() if len(away) else 0.0
-    if share < BEHIND_SHARE or np.hypot(*_mean_direction(*away[:, :2].T)) >= _SECTOR_LENGTH:
+    share = share_behind(points, model_ranges)
+    if not share:
         return None
     text = f"{share:.0%} of the points lie behind the sensor, where the model does not look: look around (--around)"
     return InputWarning("view", text)

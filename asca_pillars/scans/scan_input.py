@@ -1,9 +1,10 @@
 """Reading of scan files by `ScanSettings`, with the mounting of their sensor."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from itertools import groupby
 from pathlib import Path
 
+from asca_pillars.scans.ground_height import NamedPoints
 from asca_pillars.scans.scan_reader import ReflectanceScale, Scan, read_scan
 from asca_pillars.scans.scan_settings import ScanSettings, sample_points
 from asca_pillars.scans.stored_scans import FolderScale, folder_reflectance_scale
@@ -13,6 +14,7 @@ class ScanInput:
     """Reader of scans; the reflectance scale of each folder and suffix is decided once.
 
     Attributes:
+        paths: of the scans.
         mounting: mounting of the sensor.
         notes: sentences for the user about the settings that were chosen.
 
@@ -22,12 +24,13 @@ class ScanInput:
 
     def __init__(self, settings: ScanSettings, paths: Sequence[Path]) -> None:
         self._columns = settings.columns
+        self.paths = paths
         self._scales: dict[tuple[Path, str], FolderScale] = {}
         self.notes: list[str] = []
         stated = settings.reflectance_scale
         for key, group in groupby(sorted(paths, key=_folder_and_suffix), _folder_and_suffix):
             self._scales[key] = self._decide(key[0], list(group)) if stated == "auto" else FolderScale(stated, None)
-        self.mounting, estimate = settings.mounting(sample_points(paths, lambda path: self.read(path).points))
+        self.mounting, estimate = settings.mounting(self.samples())
         if estimate is not None:
             self.notes.append(f"sensor height: {estimate}")
 
@@ -38,6 +41,10 @@ class ScanInput:
             ScanError: as `read_scan`.
         """
         return read_scan(path, columns=self._columns, reflectance_scale=self.scale(path))
+
+    def samples(self) -> Iterator[NamedPoints]:
+        """Yield some of the scans, see `sample_points`."""
+        return sample_points(self.paths, lambda path: self.read(path).points)
 
     def scale(self, path: Path) -> ReflectanceScale:
         """Return the reflectance scale of one of the scans."""

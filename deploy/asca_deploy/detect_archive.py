@@ -14,7 +14,7 @@ from typing import NamedTuple
 from asca_deploy.bundle import MANIFEST
 from asca_deploy.detector import Detector
 from asca_deploy.manifest import load_bundle
-from asca_deploy.open_model import RuntimeOptions, open_detector
+from asca_deploy.open_model import RuntimeOptions, files_need_around, open_detector
 from asca_deploy.result_files import (
     COMMAND,
     RUN_FILE,
@@ -146,7 +146,7 @@ def detect_archive(
     options: RuntimeOptions,
     reading: ScanSettings,
     score: ScoreThresholds | None = None,
-    around: bool = False,
+    around: bool | None = None,
     progress: Progress | None = None,
     remark: Remark | None = None,
 ) -> ArchiveResult:
@@ -159,7 +159,7 @@ def detect_archive(
         options: which model runs, and how.
         reading: how the files are read and the sensor was mounted.
         score: report detections from this score on, or by class; None: the thresholds of the model.
-        around: detect in every direction, see `asca_deploy.around`.
+        around: detect in every direction, see `asca_deploy.around`; None: if the first scan lies all around the sensor.
         progress: called while it is found out what an earlier run has done.
         remark: called with what was decided for a folder.
 
@@ -174,6 +174,7 @@ def detect_archive(
     is_run = json_object("shard_size", "settings")
     require_own_results(out, {f"{SHARDS}/{RUN_SETTINGS}": is_run})
     require_own(out / SHARDS, COMMAND, {RUN_SETTINGS: is_run})
+    around = files_need_around(options, scan_input) if around is None else around
     for line in scan_input.notes:
         reporter.remark(line)
     job = _job(scan_input.mounting, reading.columns, options, out, score=score, around=around)

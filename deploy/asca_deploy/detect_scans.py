@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_deploy.detector import Detector
-from asca_deploy.open_model import RuntimeOptions, open_detector, track_thresholds
+from asca_deploy.open_model import RuntimeOptions, files_need_around, open_detector, track_thresholds
 from asca_deploy.recordings.results import FrameResult
 from asca_deploy.recordings.sequence_files import SequenceFiles
 from asca_deploy.result_files import ResultWriter
@@ -89,7 +89,7 @@ def detect_scans(
     options: RuntimeOptions = _PLAIN,
     reading: ScanSettings = _AS_TRAINED,
     score: ScoreThresholds | None = None,
-    around: bool = False,
+    around: bool | None = None,
     pictures: bool = True,
     track: bool = False,
     rate_hz: float | None = None,
@@ -109,7 +109,7 @@ def detect_scans(
         options: which model runs, and how.
         reading: how the files are read and the sensor was mounted.
         score: report detections from this score on, or by class; None: the thresholds of the model.
-        around: detect in every direction, see `asca_deploy.around`.
+        around: detect in every direction, see `asca_deploy.around`; None: if the first scan lies all around the sensor.
         pictures: whether pictures are drawn into `out`.
         track: give boxes identities and velocities over time; the scans then lie in one folder, in order.
         rate_hz: scans per second of that folder; None: 10.
@@ -141,6 +141,8 @@ def detect_scans(
     files.check([*map(Path, chosen), *paths, times])
     births, weak = track_thresholds(options.bundle, score) if track else ({}, None)
     scan_input = ScanInput(reading, paths)
+    # The labels of the sample are those ahead.
+    around = scans is not None and files_need_around(options, scan_input) if around is None else around
     detector = open_detector(options, weak if track else score, scan_input.mounting, around=around)
     tracker = Tracker(birth_score=births) if track else None
     writer = None

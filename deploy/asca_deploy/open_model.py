@@ -1,6 +1,7 @@
 """Models to run over a split: a bundle in ONNX Runtime, or a checkpoint in PyTorch."""
 
 import logging
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import cast
@@ -8,6 +9,7 @@ from typing import cast
 import numpy as np
 from numpy.typing import NDArray
 
+from asca_deploy.around import turns_around, widen_ranges
 from asca_deploy.detector import Detector
 from asca_deploy.manifest import load_bundle
 from asca_deploy.providers import Precision, Provider, arithmetic
@@ -16,10 +18,14 @@ from asca_deploy.tracker import WEAK_SHARE
 from asca_pillars.base.errors import ConfigError
 from asca_pillars.base.extras import require
 from asca_pillars.base.system import check_threads
+from asca_pillars.data.kitti import calibration_of_scan
 from asca_pillars.detection.detections import Detections
 from asca_pillars.detection.spec import ScoreThresholds
 from asca_pillars.evaluation.model import Model
+from asca_pillars.scans.ground_height import NamedPoints
+from asca_pillars.scans.input_check import share_behind
 from asca_pillars.scans.mounting import Mounting
+from asca_pillars.scans.scan_input import ScanInput
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,6 +59,44 @@ def open_detector(
         mounting=mounting,
         view="around" if around else "ahead",
     )
+
+
+def scans_need_around(
+    options: RuntimeOptions, mounting: Mounting, samples: Iterable[NamedPoints], notes: list[str]
+) -> bool:
+    """Return whether scans lie all around a model that looks ahead; if so, append a sentence for the user to `notes`.
+
+    Args:
+        options: which model.
+        mounting: mounting of the sensor.
+        samples: scans, of which the first decides.
+        notes: sentences about what was decided for the scans.
+
+    Raises:
+        AscaError: the bundle cannot be read.
+    """
+    first = next(iter(samples), None)
+    if first is None:
+        return False
+    bundle = load_bundle(find_bundle(options.bundle))
+    share = share_behind(mounting.level.points(first.points[:, :3]), bundle.spec.ranges)
+    if not share:
+        return False
+    passes = len(turns_around(widen_ranges(bundle).spec.ranges, camera_view=bundle.expected_input.camera_view))
+    cost = "in one pass" if passes == 1 else f"in {passes} passes"
+    notes.append(f"{share:.0%} of the points lie behind the sensor: looking all around, {cost} (--ahead: only ahead)")
+    return True
+
+
+def files_need_around(options: RuntimeOptions, scan_input: ScanInput) -> bool:
+    """Return `scans_need_around` of scan files, with its note; False for KITTI's, labelled in the camera's view alone.
+
+    Raises:
+        AscaError: the bundle cannot be read.
+    """
+    if calibration_of_scan(scan_input.paths[0]) is not None:
+        return False
+    return scans_need_around(options, scan_input.mounting, scan_input.samples(), scan_input.notes)
 
 
 def track_thresholds(bundle: str | Path | None, score: ScoreThresholds | None = None) -> tuple[dict[str, float], float]:

@@ -30,7 +30,7 @@ from asca_pillars.base.own_files import (
     require_own_file,
 )
 from asca_pillars.data.boxes.detector_scope import DetectorScope
-from asca_pillars.data.kitti import Calibration, is_detection_text, read_calibration
+from asca_pillars.data.kitti import Calibration, calibration_of_scan, is_detection_text, read_calibration
 from asca_pillars.data.open_split import labels_of_scan
 from asca_pillars.geometry.overlap import bev_iou
 from asca_pillars.pictures.drawing import Image
@@ -217,8 +217,8 @@ class ResultWriter:
         return {".txt"}
 
     def _calibration(self, path: Path) -> Calibration | None:
-        calib_path = path.parent.parent / "calib" / f"{path.stem}.txt"
-        if path.parent.name != "velodyne" or not calib_path.exists():
+        calib_path = calibration_of_scan(path)
+        if calib_path is None:
             return None
         try:
             return read_calibration(calib_path)

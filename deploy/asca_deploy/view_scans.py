@@ -20,7 +20,7 @@ import numpy as np
 
 from asca_deploy.browser_page import PAGE, page_modules
 from asca_deploy.detector import Detector
-from asca_deploy.open_model import RuntimeOptions, open_detector
+from asca_deploy.open_model import RuntimeOptions, files_need_around, open_detector
 from asca_deploy.result_files import scan_content
 from asca_deploy.scan_detections import ScanDetections
 from asca_deploy.shipped import sample_scan_path
@@ -66,7 +66,7 @@ class ScanServer:
         options: which model runs, and how.
         reading: how the files are read and the sensor was mounted.
         score: show detections from this score on, or by class; None: the thresholds of the model.
-        around: detect in every direction, see `asca_deploy.around`.
+        around: detect in every direction, see `asca_deploy.around`; None: if the first scan lies all around the sensor.
 
     Attributes:
         address: where the page is.
@@ -87,7 +87,7 @@ class ScanServer:
         options: RuntimeOptions = _PLAIN,
         reading: ScanSettings = _AS_TRAINED,
         score: ScoreThresholds | None = None,
-        around: bool = False,
+        around: bool | None = None,
     ) -> None:
         chosen = [Path(path) for path in scans or [sample_scan_path()]]
         if recording := next(filter(is_recording, chosen), None):
@@ -95,6 +95,8 @@ class ScanServer:
         named = name_scans(chosen)
         paths = [scan.path for scan in named]
         scan_input = ScanInput(reading, paths)
+        # The labels of the sample are those ahead.
+        around = scans is not None and files_need_around(options, scan_input) if around is None else around
         detector = open_detector(options, score, scan_input.mounting, around=around)
         thresholds = {one.name: one.score_threshold for one in detector.spec.classes}
         lowest = {

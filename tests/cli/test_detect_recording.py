@@ -48,18 +48,17 @@ def test_a_line_for_each_scan_with_its_time(drive: Path, tmp_path: Path, capsys:
     assert [line["time_ns"] for line in lines] == stamps(SCANS)
     assert lines[0]["frame_id"] == "lidar" and "track_id" not in lines[0]["boxes"][0]
     spec = load_bundle(find_bundle(None)).spec
-    ranges_m = [list(spec.ranges.x_m), list(spec.ranges.y_m)]
-    assert [line["detector"] for line in lines] == [{"classes": list(spec.class_names), "ranges_m": ranges_m}] * SCANS
+    assert [line["detector"] for line in lines] == [{"classes": list(spec.class_names), "ranges_m": None}] * SCANS
     assert {path.name for path in tmp_path.iterdir()} == {"detections.jsonl", "recording.json"}
     output = capsys.readouterr().out
-    assert "/lidar: 5 scans" in output and "ms of CPU per scan" in output
+    assert "/lidar: 5 scans" in output and "looking all around" in output and "ms of CPU per scan" in output
     # The same boxes as of the scan alone.
     np.save(tmp_path / "scan.npy", POINTS)
     detect([tmp_path / "scan.npy"], out=tmp_path / "alone", threads=1, pictures=False)
     alone = json.loads((tmp_path / "alone" / "scan.json").read_text())
     assert (alone["boxes"], alone["detector"]) == (lines[0]["boxes"], lines[0]["detector"])
-    detect([tmp_path / "scan.npy"], out=tmp_path / "around", threads=1, pictures=False, around=True)
-    assert json.loads((tmp_path / "around" / "detections.jsonl").read_text())["detector"]["ranges_m"] is None
+    (line, *_) = run(drive, tmp_path / "ahead", around=False)
+    assert line["detector"]["ranges_m"] == [list(spec.ranges.x_m), list(spec.ranges.y_m)]
 
 
 def test_times_that_no_clock_shows_end_no_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

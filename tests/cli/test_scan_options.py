@@ -40,7 +40,9 @@ def test_the_sample_seen_otherwise_gives_its_own_boxes(tmp_path: Path, sample: N
     table = np.column_stack([points[:, :3], np.round(points[:, 3] * 255), np.arange(len(points)) % 32])
     path = tmp_path / "other.bin"
     table.astype("<f4").tofile(path)
-    result, (found,) = detect(tmp_path, path, "--axes", "y-forward", "--sensor-height", "auto", "--columns", 5)
+    result, (found,) = detect(
+        tmp_path, path, "--axes", "y-forward", "--sensor-height", "auto", "--columns", 5, "--ahead"
+    )
     assert result.exit_code == 0, result.output
     assert "sensor height: 0.0" in result.output and "estimated from 1 scan" in result.output
     assert found["reflectance_scale"] == 255
@@ -62,11 +64,15 @@ def test_all_around(tmp_path: Path) -> None:
     assert len(behind) >= 3
 
 
-def test_what_is_behind_is_said_to_be_left_out(tmp_path: Path, sample: NDArray[np.float32]) -> None:
+def test_what_is_behind_is_looked_at_or_said_to_be_left_out(tmp_path: Path, sample: NDArray[np.float32]) -> None:
     write_scan(tmp_path / "ahead.bin", sample[sample[:, 0] > np.abs(sample[:, 1])])
-    result, (around, ahead) = detect(tmp_path, sample_scan_path(), tmp_path / "ahead.bin", "--no-pictures")
+    scans = sample_scan_path(), tmp_path / "ahead.bin"
+    result, found = detect(tmp_path, *scans, "--no-pictures")
+    assert "49% of the points lie behind the sensor: looking all around, in 4 passes (--ahead:" in result.output
+    assert [scan["passes"] for scan in found] == [4, 4] and not any(scan["warnings"] for scan in found)
+    result, found = detect(tmp_path, *scans, "--no-pictures", "--ahead")
     assert "street.bin: 49% of the points lie behind" in result.output and "(--around)" in result.output
-    assert ["--around" in "".join(scan["warnings"]) for scan in (around, ahead)] == [True, False]
+    assert ["--around" in "".join(scan["warnings"]) for scan in found] == [True, False]
 
 
 def test_a_folder_has_one_reflectance_scale(tmp_path: Path, sample: NDArray[np.float32]) -> None:

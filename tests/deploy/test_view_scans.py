@@ -54,7 +54,7 @@ def serving(*args: Any, bundle: str = "fast", **kwargs: Any) -> Iterator[ScanSer
 
 @pytest.fixture(scope="module")
 def server(folder: Path) -> Iterator[ScanServer]:
-    with serving([folder]) as server:
+    with serving([folder], around=False) as server:
         yield server
 
 
@@ -106,7 +106,7 @@ def shown(page: Any, found: Any) -> list[Any]:
 
 def test_what_several_passes_find_is_not_lowered() -> None:
     """Of two passes the box stays that is seen nearest to straight ahead, whatever the scores."""
-    with serving([sample_scan_path()], bundle="fast", around=True) as server:
+    with serving([sample_scan_path()]) as server:
         classes = json.loads(get(server, "page.json"))["classes"]
     assert [one["lowest"] for one in classes] == [one["score"] for one in classes]
 
@@ -158,7 +158,7 @@ def test_only_this_computer_under_its_own_name_is_answered(server: ScanServer) -
 def test_a_turned_sensor_is_drawn_level_and_saved_in_its_own_frame(tmp_path: Path) -> None:
     turned = np.column_stack([-POINTS[:, 1], POINTS[:, 0], POINTS[:, 2:]])
     np.save(tmp_path / "turned.npy", turned)
-    with serving([tmp_path / "turned.npy"], reading=ScanSettings(axes="y-forward")) as server:
+    with serving([tmp_path / "turned.npy"], around=False, reading=ScanSettings(axes="y-forward")) as server:
         points = np.frombuffer(get(server, "scans/0.bin"), "<f4").reshape(-1, 4)
         found = json.loads(get(server, "scans/0.json"))
     np.testing.assert_array_equal(points, POINTS)
@@ -187,6 +187,7 @@ def test_the_command_ends_on_ctrl_c_without_a_traceback(folder: Path) -> None:
         "asca_pillars.cli",
         "view",
         str(folder / "1.bin"),
+        "--ahead",
         "--no-browser",
         "--threads",
         "1",

@@ -3,6 +3,7 @@
 from asca_pillars.data.kitti.calibration import (
     DEFAULT_IMAGE_SIZE_WH,
     Calibration,
+    calibration_of_scan,
     image_boxes,
     in_image,
     read_calibration,
@@ -27,6 +28,7 @@ __all__ = [
     "KittiObject",
     "KittiSplit",
     "boxes_from_objects",
+    "calibration_of_scan",
     "image_boxes",
     "in_image",
     "is_detection_text",

@@ -140,6 +140,12 @@ def image_boxes(
     return np.where(outside[:, None], -1.0, pixels), np.where(outside, 1.0, np.clip(truncated, 0, 1))
 
 
+def calibration_of_scan(path: Path) -> Path | None:
+    """Return the calibration file that belongs to a scan in KITTI's layout; None for scans in another."""
+    calib_path = path.parent.parent / "calib" / f"{path.stem}.txt"
+    return calib_path if path.parent.name == "velodyne" and calib_path.exists() else None
+
+
 def read_calibration(path: str | Path) -> Calibration:
     """Read a KITTI calibration file of the object or the tracking benchmark.
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from asca_deploy.detect_scans import DetectedScan, repairs
 from asca_deploy.detector import Detector
-from asca_deploy.open_model import RuntimeOptions, open_detector, track_thresholds
+from asca_deploy.open_model import RuntimeOptions, open_detector, scans_need_around, track_thresholds
 from asca_deploy.recordings.journal import JOURNAL_FILE, Journal, ScanResult, is_journal
 from asca_deploy.recordings.results import (
     FrameResult,
@@ -80,7 +80,7 @@ class _Task:
     path: Path
     out: Path
     score: ScoreThresholds | None
-    around: bool
+    around: bool | None
     topic: str | None
     frame: str | None
     track: bool
@@ -107,7 +107,7 @@ def detect_recording(
     options: RuntimeOptions = _PLAIN,
     reading: ScanSettings = _AS_TRAINED,
     score: ScoreThresholds | None = None,
-    around: bool = False,
+    around: bool | None = None,
     progress: Progress | None = None,
     remark: Remark | None = None,
 ) -> RecordingResult:
@@ -130,7 +130,7 @@ def detect_recording(
         options: which model runs, and how.
         reading: how the sensor was mounted.
         score: report detections from this score on, or by class; None: the thresholds of the model.
-        around: detect in every direction, see `asca_deploy.around`.
+        around: detect in every direction, see `asca_deploy.around`; None: if the first scan lies all around the sensor.
         progress: called after each scan.
         remark: called with each of the result's `remarks` as soon as it is known.
 
@@ -177,6 +177,7 @@ def _detect(task: _Task, reading: ScanSettings, options: RuntimeOptions, reporte
     scans = RecordedScans(recording, topic, reading.reflectance_scale, task.frame)
     topic = scans.topic
     mounting, said = scans.mounting(reading)
+    around = scans_need_around(options, mounting, scans.samples(), said) if task.around is None else task.around
     images = None if task.files.rerun is None else NearestImages(recording, task.image_topic)
     if images is not None and images.topic is not None and images.others:
         said.append(f"images: of {images.topic.name}; --image-topic takes others of {topics_text(images.others)}")
@@ -184,8 +185,8 @@ def _detect(task: _Task, reading: ScanSettings, options: RuntimeOptions, reporte
         reporter.remark(line)
     births, weak = track_thresholds(options.bundle, task.score)
     least = weak if task.track else task.score
-    detector = open_detector(options, least, mounting, around=task.around)
-    about = _about(task, reading, mounting, detector, topic.name, least)
+    detector = open_detector(options, least, mounting, around=around)
+    about = _about(task, reading, mounting, detector, topic.name, least, around=around)
     with Journal(task.out, about, detector.spec.class_names) as journal:
         if journal.done:
             reporter.remark(f"going on after the {journal.done} scans that {journal.path} holds")
@@ -207,7 +208,7 @@ def _detect(task: _Task, reading: ScanSettings, options: RuntimeOptions, reporte
         pose_at = None if poses is None else partial(_pose_of_scan, poses, mounting)
         results = _with_points(track_results(journal, tracker, pose_at), scans if task.files.show_points else None)
         opened = partial(task.files.open, detector=detector, times_ns=times_ns, pose_at=pose_at, images=images)
-        scope = detector_scope(detector.spec, around=task.around)
+        scope = detector_scope(detector.spec, around=around)
         written, classes = _write(task, results, calibration, scope, about, opened)
         journal.remove()
     for line in (*repairs(run.kept), *(() if images is None else images.remarks())):
@@ -302,6 +303,8 @@ def _about(
     detector: Detector,
     topic: str,
     least: ScoreThresholds | None,
+    *,
+    around: bool,
 ) -> dict[str, Any]:
     """Return all that detections depend on; a journal is only resumed if it is the same."""
     files = recording_files(task.path)
@@ -313,9 +316,9 @@ def _about(
         "made_by": detector.made_by,
         "model": {name: graph.sha256 for name, graph in detector.bundle.graphs.items()},
         "runs_on": detector.runs_on,
-        **detector_scope(detector.spec, around=task.around).to_json(),
+        **detector_scope(detector.spec, around=around).to_json(),
         "score": least,
-        "around": task.around,
+        "around": around,
         "mounting": to_dict(mounting),  # content of the files that `reading` names
         "reading": {name: None if value is None else str(value) for name, value in asdict(reading).items()},
     }
