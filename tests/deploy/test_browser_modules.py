@@ -107,16 +107,15 @@ def test_overlaps_of_random_boxes() -> None:
     assert np.count_nonzero(expected[::5]) > 1000
 
 
-def test_a_revolution_is_said_to_be_cut() -> None:
+def test_a_revolution_lies_behind_the_sensor_too() -> None:
     points = read_scan(sample_scan_path()).points[::40]
     ranges = [[0, 69.12], [-30.72, 30.72], [-3, 1]]
     ahead = points[points[:, 0] > 0]
     every_way = [[-50, 50], *ranges[1:]]
     cases = [(ranges, points), (ranges, ahead), (every_way, points), (ranges, points[:0])]
-    found = call("grid.js", "unseenDirections", *([{"ranges": own}, scan.reshape(-1).tolist()] for own, scan in cases))
+    found = call("grid.js", "percentBehind", *([{"ranges": own}, scan.reshape(-1).tolist()] for own, scan in cases))
     cut, *fine = (answer["result"] for answer in found)
-    assert len(cut) == 1 and "look all around" in cut[0]
-    assert fine == [[], [], []]
+    assert cut == 49 and fine == [0, 0, 0]
 
 
 @pytest.mark.parametrize("axes", ["x-forward", "y-forward", "-y,x,z", " -x, -y,+z", "x,-y,-z", "x,-y,z"])

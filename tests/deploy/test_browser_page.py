@@ -73,6 +73,8 @@ def test_the_browser_finds_the_boxes_that_python_finds(name: str, tmp_path: Path
     detector = Detector(bundle, threads=1)
     with file_server(page) as address:
         tab.call("Page.navigate", url=address)
+        finished(tab, "sample.bin")
+        set_sensor(tab)
         assert_same(finished(tab, "sample.bin"), detector, points)
         assert_drawn(tab, tmp_path / "page.png")
         for score in (0.2, 0.9, detector.spec.classes[0].score_threshold):
@@ -117,10 +119,14 @@ def test_the_browser_looks_around_and_takes_a_mounting_as_python_does(name: str,
     write_scan(tmp_path / "raised.bin", raised)
     with file_server(page) as address:
         tab.call("Page.navigate", url=address)
+        by_itself = finished(tab, "sample.bin")
+        assert by_itself["passes"] == 4 and "49% of the points lie behind the sensor: looked at all" in status(tab)
+        set_sensor(tab)
         ahead = finished(tab, "sample.bin")
         set_sensor(tab, around=True)
         around = Detector(bundle, threads=1, view="around")
         saved = finished(tab, "sample.bin")
+        assert saved["boxes"] == by_itself["boxes"]
         assert_same(saved, around, points, least=len(ahead["boxes"]) + 4)
         assert (saved["passes"], saved["warnings"]) == (4, []) and "in 4 passes" in status(tab)
         low = {"Car": 0.15, "Pedestrian": 0.2}
@@ -159,6 +165,8 @@ def test_the_browser_looks_around_in_one_pass_where_python_does(tmp_path: Path, 
     write_page(page, bundle, sample_scan_path(), find_ort_web(Path(str(ORT_WEB))))
     with file_server(page) as address:
         tab.call("Page.navigate", url=address)
+        finished(tab, "sample.bin")
+        set_sensor(tab)
         ahead = finished(tab, "sample.bin")
         for around in (True, False):
             set_sensor(tab, around=around)
@@ -169,7 +177,7 @@ def test_the_browser_looks_around_in_one_pass_where_python_does(tmp_path: Path, 
 
 
 def set_sensor(tab: Tab, *, around: bool = False, axes: str = "", height: str = "") -> None:
-    fields = f"around.checked = {str(around).lower()}; axes.value = {axes!r}; height.value = {height!r}"
+    fields = f"around.value = {'around' if around else 'ahead'!r}; axes.value = {axes!r}; height.value = {height!r}"
     names = "[around, axes, height] = ['around', 'axes', 'height'].map((id) => document.getElementById(id))"
     tab.evaluate(f"(() => {{ const {names}; {fields}; sensor.dispatchEvent(new Event('change')); }})()")
 

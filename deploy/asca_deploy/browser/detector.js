@@ -3,7 +3,7 @@
 import { aboutGround, turnsAround, widenRanges } from "./around.js";
 import { decodeCandidates, suppress } from "./boxes.js";
 import { changeBox, changePoints, inverse, turnBy } from "./frames.js";
-import { makeGrid, unseenDirections } from "./grid.js";
+import { makeGrid, percentBehind } from "./grid.js";
 import { Canvas, pillarize } from "./pillars.js";
 import { NeckTableBuilder } from "./tables.js";
 
@@ -50,15 +50,22 @@ export class Detector {
   /**
    * The boxes of one scan, pass by pass and the best first, in the scan's frame.
    * @param {Float32Array} points x, y, z in metres (the model's frame), reflectance 0..1 of each of N points
-   * @param {boolean} around look in every direction; the boxes of several passes are to be merged (`around.js`)
+   * @param {boolean|undefined} around look in every direction, undefined: where points lie behind the sensor; the boxes of
+   *   several passes are to be merged (`around.js`)
    * @returns {Promise<{detections: object[], passes: number, timesMs: object, counts: object, remarks: string[]}>}
    */
-  async detect(points, around = false) {
-    const field = this.field(around);
-    const turns = around ? turnsAround(field.spec.grid, this.manifest.expected_input.camera_view) : [turnBy(0)];
+  async detect(points, around) {
+    const behind = percentBehind(this.field(false).grid, points);
+    const everywhere = around ?? behind > 0;
+    const field = this.field(everywhere);
+    const turns = everywhere ? turnsAround(field.spec.grid, this.manifest.expected_input.camera_view) : [turnBy(0)];
     const [timesMs, detections] = [{}, []];
     const counts = { points: 0, points_outside: 0, pillars: 0 };
-    const remarks = around ? [] : unseenDirections(field.grid, points);
+    const remarks = [];
+    if (behind > 0 && around === undefined) remarks.push(`${behind}% of the points lie behind the sensor: looked at all around.`);
+    if (behind > 0 && !everywhere) {
+      remarks.push(`${behind}% of the points lie behind the sensor, where the model does not look: look all around.`);
+    }
     const level = turns.length === 1 ? turns : aboutGround(turns, points);
     for (const [pass, turn] of level.entries()) {
       const back = inverse(turn);

@@ -56,12 +56,12 @@ const BEHIND_SHARE = 0.2;
 const BODY_M = 3;
 
 /**
- * What a user is to know of where the model looks: nothing, or a sentence of a scan that goes on behind its sensor.
+ * Per cent of the points behind the sensor, where the model does not look; 0 below BEHIND_SHARE.
  * @param {object} grid of `makeGrid`
  * @param {Float32Array} points x, y, z in metres and reflectance of each of N points
- * @returns {string[]}
+ * @returns {number}
  */
-export function unseenDirections(grid, points) {
+export function percentBehind(grid, points) {
   const [[xLow, xHigh], [yLow, yHigh]] = grid.ranges;
   const reach = Math.min(xHigh, -yLow, yHigh);
   let away = 0;
@@ -72,9 +72,7 @@ export function unseenDirections(grid, points) {
     away += 1;
     if (reach > 0 && x * reach < Math.min(xLow, 0) * Math.hypot(x, y)) behind += 1;
   }
-  if (away === 0 || behind / away < BEHIND_SHARE) return [];
-  const share = Math.round((100 * behind) / away);
-  return [`${share}% of the points lie behind the sensor, where the model does not look: look all around.`];
+  return away === 0 || behind / away < BEHIND_SHARE ? 0 : Math.round((100 * behind) / away);
 }
 
 /** Index of the interval [edges[i], edges[i + 1]) around a value, for evenly spaced edges. */

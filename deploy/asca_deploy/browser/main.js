@@ -51,7 +51,7 @@ async function detect(file) {
   document.body.dataset.state = "busy";
   say(`${file.name}: detecting`);
   const [axes, height] = ["axes", "height"].map((id) => element(id).value.trim());
-  const sensor = { axes, height, around: element("around").checked };
+  const sensor = { axes, height, around: { around: true, ahead: false }[element("around").value] };
   try {
     found = { name: file.name, ...(await detector.detect(file, sensor, (points) => scene.show(points, []))) };
     show();

@@ -21,7 +21,7 @@ export class WorkerDetector {
   /**
    * The boxes of one file.
    * @param {{name: string, buffer: ArrayBuffer}} file
-   * @param {{axes: string, height: string, around: boolean}} sensor as `asca detect` takes it; empty: as in training
+   * @param {{axes: string, height: string, around: boolean|undefined}} sensor as `asca detect` takes it; empty: as in training
    * @param {(points: Float32Array) => void} preview called with the points, before the boxes are there
    */
   detect(file, sensor, preview) {
