@@ -190,6 +190,8 @@ def simulate(
 
 def _report_statistics(out: Path, console: "Console") -> None:
     """Compare the frames below `out` with KITTI; print the tables and write them, and the plots, to out/report/."""
+    from asca_pillars.base.progress import Reporter
+    from asca_pillars.cli.progress import Bars
     from asca_pillars.sim.report.comparison import compare, measure
     from asca_pillars.sim.report.plots import write_plots
     from asca_pillars.sim.report.reference import kitti_reference
@@ -197,7 +199,8 @@ def _report_statistics(out: Path, console: "Console") -> None:
 
     folder = _claimed(out)
     reference = kitti_reference()
-    measured = measure(out)
+    with Bars(console) as bars:
+        measured = measure(out, reporter=Reporter(bars))
     comparison = compare(measured, reference.statistics)
     print_comparison(comparison, console)
     write_report(folder, comparison, write_plots(folder, comparison, measured, reference.sensor))
@@ -207,12 +210,16 @@ def _report_statistics(out: Path, console: "Console") -> None:
 def _report_like_for_like(out: Path, like: Path, bundle: Path | None, console: "Console") -> None:
     """Compare the objects below `out` with those of a real folder; print the tables and write them to out/report/."""
     from asca_deploy.open_model import RuntimeOptions, open_model
+    from asca_pillars.base.progress import Reporter
+    from asca_pillars.cli.progress import Bars
     from asca_pillars.sim.report.like_for_like import MIN_SCORE, compare_like_for_like
     from asca_pillars.sim.report.like_tables import print_like, write_like
 
     folder = _claimed(out)
     detect = None if bundle is None else open_model(RuntimeOptions(bundle=bundle), MIN_SCORE).detect
-    result = compare_like_for_like(like, out, detect, None if bundle is None else str(bundle))
+    with Bars(console) as bars:
+        name = None if bundle is None else str(bundle)
+        result = compare_like_for_like(like, out, detect, name, Reporter(bars))
     print_like(result, console)
     write_like(folder, result)
     console.print(f"Written: {folder}/like_for_like.md, .json and .png", soft_wrap=True)

@@ -7,9 +7,9 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from rich.progress import track
 
 from asca_pillars.base.errors import DatasetError
+from asca_pillars.base.progress import SILENT, Reporter
 from asca_pillars.data.kitti import KittiSplit
 from asca_pillars.sim.report.label_statistics import fits_of, label_statistics
 from asca_pillars.sim.report.reference import (
@@ -91,7 +91,7 @@ class Measured:
     records: Sequence[ScanRecord]
 
 
-def measure(root: str | Path, *, max_scans: int = MAX_SCANS, progress: bool = True) -> Measured:
+def measure(root: str | Path, *, max_scans: int = MAX_SCANS, reporter: Reporter = SILENT) -> Measured:
     """Measure the frames of `root`/training, at most `max_scans` of their scans, evenly spaced.
 
     Raises:
@@ -105,9 +105,7 @@ def measure(root: str | Path, *, max_scans: int = MAX_SCANS, progress: bool = Tr
     labels, dont_care = label_statistics(split, frame_ids)
     chosen = np.linspace(0, len(frame_ids) - 1, min(max_scans, len(frame_ids))).round().astype(int)
     sensor = kitti_reference().sensor
-    records = [
-        measure_scan(split, frame_ids[index], sensor) for index in track(chosen, "Measuring", disable=not progress)
-    ]
+    records = [measure_scan(split, frame_ids[index], sensor) for index in reporter.track(chosen, "Measuring")]
     fits = fits_of({name: np.concatenate([record.fits[name] for record in records]) for name in CLASSES}, str(root))
     return Measured(Statistics(str(root), scan_statistics(records), len(frame_ids), labels, dont_care, fits), records)
 

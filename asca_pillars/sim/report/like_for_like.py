@@ -8,9 +8,9 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from rich.progress import track
 
 from asca_pillars.base.errors import DatasetError
+from asca_pillars.base.progress import SILENT, Reporter
 from asca_pillars.data.insertion.ground_fit import fit_ground
 from asca_pillars.data.kitti import Calibration, KittiObject, KittiSplit, boxes_from_objects, in_image
 from asca_pillars.detection.detections import Detections
@@ -375,7 +375,7 @@ class LikeForLike:
         return {**sides, "detector": self.detector, "rows": _finite(rows), "firing": _finite(firing)}
 
 
-def measure_side(root: str | Path, detect: Detect | None, title: str) -> Side:
+def measure_side(root: str | Path, detect: Detect | None, title: str, reporter: Reporter) -> Side:
     """Measure the frames of `root`/training, at most MAX_FRAMES, evenly spaced, in the camera's field of view.
 
     Raises:
@@ -387,7 +387,7 @@ def measure_side(root: str | Path, detect: Detect | None, title: str) -> Side:
     chosen = np.linspace(0, len(ids) - 1, min(MAX_FRAMES, len(ids))).round().astype(int)
     records: list[ObjectRecord] = []
     clusters: list[Cluster] = []
-    for index in track(chosen, title):
+    for index in reporter.track(chosen, title):
         calibration = split.calibration(ids[index])
         points = read_scan(split.scan_path(ids[index])).points
         points = points[in_image(points, calibration, split.image_size_wh(ids[index]))]
@@ -403,7 +403,11 @@ def measure_side(root: str | Path, detect: Detect | None, title: str) -> Side:
 
 
 def compare_like_for_like(
-    real_root: str | Path, simulated_root: str | Path, detect: Detect | None = None, detector: str | None = None
+    real_root: str | Path,
+    simulated_root: str | Path,
+    detect: Detect | None = None,
+    detector: str | None = None,
+    reporter: Reporter = SILENT,
 ) -> LikeForLike:
     """Measure both folders and compare them.
 
@@ -412,12 +416,13 @@ def compare_like_for_like(
         simulated_root: simulated ones.
         detect: points of a scan -> detections from MIN_SCORE on; without it no scores and no firing rates.
         detector: its name.
+        reporter: told of each frame.
 
     Raises:
         DatasetError: a folder cannot be read, or no class has a real object and enough simulated ones.
     """
-    real = measure_side(real_root, detect, "Real frames")
-    simulated = measure_side(simulated_root, detect, "Simulated frames")
+    real = measure_side(real_root, detect, "Real frames", reporter)
+    simulated = measure_side(simulated_root, detect, "Simulated frames", reporter)
     rows = compare_objects(real.records, simulated.records)
     if not rows:
         raise DatasetError(

@@ -19,7 +19,7 @@ from tests.sim.report.made_up import write_set
 
 @pytest.fixture(scope="module")
 def measured(tmp_path_factory: pytest.TempPathFactory) -> Measured:
-    return measure(write_set(tmp_path_factory.mktemp("whole")), progress=False)
+    return measure(write_set(tmp_path_factory.mktemp("whole")))
 
 
 def row(comparison: Comparison, name: str) -> Row:
@@ -37,7 +37,7 @@ def test_a_set_is_like_itself(measured: Measured) -> None:
 
 
 def test_a_shifted_histogram_is_caught(measured: Measured, tmp_path: Path) -> None:
-    brighter = measure(write_set(tmp_path, brighter=0.1), progress=False)
+    brighter = measure(write_set(tmp_path, brighter=0.1))
     comparison = compare(brighter, measured.statistics)
     missed = {item.name for item in comparison.missed}
     assert missed == {f"reflectance: {name}" for name in ("overall", "ground", "non_ground", "car", "pedestrian")}
@@ -67,7 +67,7 @@ def test_few_real_objects_excuse_what_chance_explains() -> None:
 
 
 def test_what_cannot_be_compared_is_said(measured: Measured, tmp_path: Path) -> None:
-    view = measure(write_set(tmp_path, camera_view=True), progress=False)
+    view = measure(write_set(tmp_path, camera_view=True))
     comparison = compare(view, kitti_reference().statistics)
     names = {item.name for item in comparison.rows}
     assert "points in camera view" in names and "points of a car at 20 m" in names

@@ -13,7 +13,7 @@ from tests.sim.report.made_up import CAR_LAW, COLUMNS, GROUND_Z_M, SENSOR, rings
 
 @pytest.fixture(scope="module")
 def measured(tmp_path_factory: pytest.TempPathFactory) -> Measured:
-    return measure(write_set(tmp_path_factory.mktemp("whole")), progress=False)
+    return measure(write_set(tmp_path_factory.mktemp("whole")))
 
 
 def test_scans(measured: Measured) -> None:
@@ -66,7 +66,7 @@ def test_labels(measured: Measured) -> None:
 
 
 def test_a_camera_view_gives_what_it_can(measured: Measured, tmp_path: Path) -> None:
-    view = measure(write_set(tmp_path, camera_view=True), progress=False).statistics
+    view = measure(write_set(tmp_path, camera_view=True)).statistics
     assert view.labels == measured.statistics.labels
     assert view.scan.car_fit == measured.statistics.scan.car_fit
     assert view.scan.camera_points == measured.statistics.scan.camera_points
@@ -94,21 +94,21 @@ def test_a_fit_needs_cars_that_stand_apart() -> None:
 
 def test_only_so_many_scans_are_read(tmp_path: Path) -> None:
     root = write_set(tmp_path)
-    some = measure(root, max_scans=2, progress=False)
+    some = measure(root, max_scans=2)
     assert some.statistics.scan.scans == 2 and some.statistics.frames == 6
     assert [round(float(record.cars[0, 0]), 1) for record in some.records] == [12.5, 37.5]
 
 
 def test_bad_folders_are_refused_in_one_line(tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match=r"no \*\.bin scans there"):
-        measure(tmp_path, progress=False)
+        measure(tmp_path)
     root = write_set(tmp_path / "set", 2)
     (root / "training/velodyne/000001.bin").write_bytes(b"12345")
     with pytest.raises(ScanError, match=r"000001\.bin: 5 bytes"):
-        measure(root, progress=False)
+        measure(root)
     (root / "training/label_2/000001.txt").unlink()
     with pytest.raises(DatasetError, match=r"000001\.txt: cannot read the labels"):
-        measure(root, progress=False)
+        measure(root)
     (root / "training/label_2/000000.txt").unlink()
     with pytest.raises(DatasetError, match="label_2: no labels there"):
-        measure(root, progress=False)
+        measure(root)
