@@ -7,7 +7,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from multiprocessing.context import SpawnProcess
 from pathlib import Path
 
@@ -60,13 +60,6 @@ def killed(number: int) -> int:
     return number
 
 
-def test_a_process_that_is_killed_ends_the_work() -> None:
-    """The kernel does that where memory runs out; the pool of the standard library then waits forever."""
-    results = map_in_processes(killed, range(40), 2, "Killed", progress=False)
-    with pytest.raises(WorkerError, match=r"1 of 2 worker processes were killed, .*; use fewer workers"):
-        list(results)
-
-
 def unhurried(number: int) -> int:
     time.sleep(0.05 if number else 0)
     return os.getpid()
@@ -97,9 +90,17 @@ def fails_oddly(number: int) -> int:
     return number
 
 
-def test_an_error_that_cannot_be_sent_ends_the_work() -> None:
-    with pytest.raises(TypeError, match="second"):
-        list(map_in_processes(fails_oddly, range(40), 2, "Odd", progress=False))
+@pytest.mark.parametrize(
+    ("job", "error", "message"),
+    [
+        # The kernel kills where memory runs out; the pool of the standard library then waits forever.
+        (killed, WorkerError, r"1 of 2 worker processes were killed, .*; use fewer workers"),
+        (fails_oddly, TypeError, "second"),
+    ],
+)
+def test_what_befalls_a_process_ends_the_work(job: Callable[[int], int], error: type[Exception], message: str) -> None:
+    with pytest.raises(error, match=message):
+        list(map_in_processes(job, range(40), 2, "Jobs", progress=False))
 
 
 def test_a_process_that_cannot_be_started_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -21,12 +21,10 @@ STREET = np.column_stack([RNG.uniform(-60, 60, (4000, 2)), RNG.uniform(-2, 3, 40
 NUSCENES = np.column_stack([STREET, RNG.integers(0, 32, 4000)]).astype("f4")
 
 
-def ascii_pcd(*rows: str, fields: str = "x y z i", points: int | None = None) -> bytes:
+def ascii_pcd(*rows: str, fields: str = "x y z i") -> bytes:
     width = len(fields.split())
-    header = (
-        f"FIELDS {fields}\nSIZE{' 4' * width}\nTYPE{' F' * width}\nPOINTS {len(rows) if points is None else points}"
-    )
-    return "\n".join([header, "DATA ascii", *rows, ""]).encode()
+    header = f"FIELDS {fields}\nSIZE{' 4' * width}\nTYPE{' F' * width}\nPOINTS {len(rows)}\nDATA ascii"
+    return "\n".join([header, *rows, ""]).encode()
 
 
 # --- what would take minutes or gigabytes
@@ -36,7 +34,6 @@ def ascii_pcd(*rows: str, fields: str = "x y z i", points: int | None = None) ->
     ("name", "content", "words"),
     {
         "many words in POINTS": ("a.pcd", pcd("ascii").replace(b"POINTS 4", b"POINTS" + b" 9" * 20_000), "POINTS is"),
-        "long header": ("a.pcd", b"# \n" * 30_000 + pcd("ascii"), "no DATA line within"),
         "a million fields": ("a.pcd", pcd("ascii").replace(b"normal", b"n " * 1_000_000), "no DATA line within"),
         "LZF bomb": (
             "a.pcd",
@@ -98,30 +95,18 @@ def test_a_file_that_does_not_fit_into_memory_is_an_error_of_one_line(tmp_path, 
         read(tmp_path, "a.bin", POINTS.tobytes())
 
 
-# --- shifted columns, contradictions
-
-
-def test_a_line_with_a_value_too_few_or_too_many_shifts_nothing(tmp_path):
-    with pytest.raises(ScanError, match="point 0 has 3 values where the fields need 4"):
-        read(tmp_path, "a.pcd", ascii_pcd("1 2 3", "1 2 3 .4", "1 2 3 .4 5"))
-    content = ply("ascii")
-    with pytest.raises(ScanError, match=r"point 1 has 4 values where the fields need 5"):
-        read(tmp_path, "a.ply", content.replace(b" 70.125 1.0\n", b" 70.125\n"))
+# --- shifted columns
 
 
 @pytest.mark.parametrize(
     ("name", "content", "words"),
-    {
-        "POINTS and WIDTH": ("a.pcd", pcd("binary").replace(b"WIDTH 4", b"WIDTH 3"), "POINTS is 4 and WIDTH times"),
-        "two bodies": ("a.pcd", pcd("binary") + pcd("binary")[-108:], "216 bytes where the header states 4 points"),
-        "more lines": ("a.pcd", ascii_pcd("1 2 3 .4", "1 2 3 .4", points=1), "2 lines where"),
-        "two x": ("a.pcd", ascii_pcd("1 2 3 .4 5", fields="x y z i x"), "2 fields x"),
-        "two HEIGHT": ("a.pcd", pcd("ascii").replace(b"HEIGHT", b"HEIGHT 1\nHEIGHT"), "two HEIGHT lines"),
-        "two x in PLY": ("a.ply", ply("ascii").replace(b"uchar red", b"uchar x"), "2 fields x"),
-        "two vertex": ("a.ply", ply("ascii").replace(b"element face", b"element vertex"), "two elements vertex"),
-    }.values(),
+    [
+        ("a.pcd", ascii_pcd("1 2 3", "1 2 3 .4", "1 2 3 .4 5"), "point 0 has 3 values where the fields need 4"),
+        ("a.pcd", ascii_pcd("1 2 3 .4 5", fields="x y z i x"), "2 fields x"),
+        ("a.ply", ply("ascii").replace(b" 70.125 1.0\n", b" 70.125\n"), "point 1 has 4 values where the fields need 5"),
+    ],
 )
-def test_contradictions_are_refused(tmp_path, name, content, words):
+def test_a_line_with_a_value_too_few_or_too_many_shifts_nothing(tmp_path, name, content, words):
     with pytest.raises(ScanError, match=words):
         read(tmp_path, name, content)
 
@@ -171,28 +156,25 @@ def test_a_folder_has_one_scale(tmp_path):
     assert read_scan(paths[2], reflectance_scale=scale).points[:, 3].max() <= 1 / 255
 
 
-def test_reflectivity_is_a_reflectance(tmp_path):
-    np.testing.assert_allclose(read(tmp_path, "a.pcd", pcd("ascii", field="reflectivity")).points, POINTS)
-
-
 # --- columns
 
 
-@pytest.mark.parametrize("count", [4000, 3999])
-def test_five_columns_are_found_and_said(tmp_path, count):
-    scan = read(tmp_path, "a.bin", NUSCENES[:count].tobytes())
-    np.testing.assert_array_equal(scan.points, STREET[:count])
-    assert "5 columns" in scan.notes.remarks[0]
+@pytest.mark.parametrize(
+    ("stored", "said"),
+    {
+        "five": (NUSCENES, True),
+        "five, no whole number of four": (NUSCENES[:3999], True),
+        "five, rings left out by an exporter": (NUSCENES * np.array([1, 1, 1, 1, 0], np.float32), True),
+        "four": (STREET, False),
+    }.values(),
+)
+def test_four_or_five_columns_are_found_and_five_are_said(tmp_path, stored, said):
+    scan = read(tmp_path, "a.bin", stored.tobytes())
+    np.testing.assert_array_equal(scan.points, stored[:, :4])
+    assert ["5 columns" in remark for remark in scan.notes.remarks] == [True] * said
 
 
-def test_five_columns_are_found_where_an_exporter_left_the_rings_out(tmp_path):
-    points = np.column_stack([STREET[:4000, :4], np.zeros(4000, np.float32)]).astype("<f4")
-    points.tofile(tmp_path / "a.bin")
-    scan = read_scan(tmp_path / "a.bin")
-    assert len(scan.points) == 4000 and "5 columns" in scan.notes.remarks[0]
-
-
-def test_columns_can_be_stated(tmp_path):
+def test_columns_can_be_stated_and_are_asked_for_where_both_fit(tmp_path):
     (tmp_path / "a.bin").write_bytes(NUSCENES.tobytes())
     np.testing.assert_array_equal(read_scan(tmp_path / "a.bin", columns=5).points, STREET)
     assert len(read_scan(tmp_path / "a.bin", columns=4).points) == 5000
@@ -203,18 +185,8 @@ def test_columns_can_be_stated(tmp_path):
     for wrong, words in ((7, "7 columns"), (2, "3 to 16"), (17, "3 to 16")):
         with pytest.raises(ScanError, match=words):
             read_scan(tmp_path / "a.bin", columns=wrong)
-
-
-def test_four_columns_stay_four(tmp_path):
-    scan = read(tmp_path, "a.bin", STREET.tobytes())
-    np.testing.assert_array_equal(scan.points, STREET)
-    assert scan.notes.remarks == ()
-
-
-def test_four_or_five_columns_are_asked_for(tmp_path):
-    whole = np.arange(80, dtype="<f4")
     with pytest.raises(ScanError, match=r"four columns .* or five .*state which"):
-        read(tmp_path, "a.bin", whole.tobytes())
+        read(tmp_path, "c.bin", np.arange(80, dtype="<f4").tobytes())
 
 
 # --- arrays
