@@ -110,13 +110,11 @@ def test_reflectance_is_lost_in_part_or_is_one_value() -> None:
 
 def test_a_cut_is_that_of_the_sensor_wherever_the_origin_is() -> None:
     """Points of a vehicle's frame, whose sensor stands on its roof, lose what those of the sensor's own frame lose."""
-    cut, (x, y, z) = config(object_cut_probability=1.0), (1.5, 0.25, 2.0)
+    cut, sensor_m = config(object_cut_probability=1.0), (1.5, 0.25, 2.0)
     boxes = BOXES + np.array([0, 0, 0, 0.02, 0.02, 0.02, 0], np.float32)  # no point on a face
-    lifted_points, lifted_boxes = POINTS.copy(), boxes.copy()
-    lifted_points[:, :3] += np.array([x, y, z], np.float32)
-    lifted_boxes[:, :3] += np.array([x, y, z], np.float32)
+    lifted = POINTS + np.array([*sensor_m, 0], np.float32), boxes + np.array([*sensor_m, 0, 0, 0, 0], np.float32)
     for seed in range(6):
         own = corrupt_objects(POINTS, boxes, cut, np.random.default_rng(seed))
-        found = corrupt_objects(lifted_points, lifted_boxes, cut, np.random.default_rng(seed), (x, y, z))
-        from_the_origin = corrupt_objects(lifted_points, lifted_boxes, cut, np.random.default_rng(seed))
+        found = corrupt_objects(*lifted, cut, np.random.default_rng(seed), sensor_m)
+        from_the_origin = corrupt_objects(*lifted, cut, np.random.default_rng(seed))
         assert abs(len(found) - len(own)) <= 1 < abs(len(from_the_origin) - len(own))

@@ -16,7 +16,7 @@ from asca_pillars.data.boxes.box_records import json_line, read_frames, records_
 from asca_pillars.data.boxes.box_split import BoxSplit
 from asca_pillars.data.frames import read_frame
 from asca_pillars.data.insertion.insert_objects import insert_objects, prepare_inserter
-from asca_pillars.data.inspection.findings import findings
+from asca_pillars.data.inspection.findings import Finding, findings
 from asca_pillars.data.inspection.inspect_dataset import inspect_dataset
 from asca_pillars.data.kitti import KittiSplit
 from asca_pillars.data.open_split import open_split
@@ -24,7 +24,6 @@ from asca_pillars.data.training_frames import open_frames
 from asca_pillars.detection.anchors import ClassSpec
 from asca_pillars.scans.mounting import Mounting
 from asca_pillars.scans.scan_reader import read_scan, write_scan
-from tests.data.boxes.box_scenes import write_box_dataset
 from tests.helpers.scenes import SPEC, make_scene, write_dataset
 
 CLASSES = (SPEC.classes[0], ClassSpec("Forklift", 0.8, 0.6, 1.73, -0.87, 0.35, 0.2))
@@ -111,8 +110,7 @@ def test_inspection_and_insertion_read_it(root: Path) -> None:
     assert not [finding for finding in findings(inspection, spec, 1) if finding.level == "error"]
     inserter = prepare_inserter(split, spec, CONFIG.data, InsertConfig("gt_aug", objects=4))
     frame = read_frame(split, "000000", spec.class_names)
-    grown = insert_objects(frame, inserter, np.random.default_rng(0))
-    assert len(grown.boxes) > len(frame.boxes)
+    assert len(insert_objects(frame, inserter, np.random.default_rng(0)).boxes) > len(frame.boxes)
     assert inserter.free_space("000000").free.any()
 
 
@@ -132,28 +130,25 @@ def test_prepare_makes_the_maps_that_training_reads(
 def test_inspection_notices_axes_that_lie_otherwise(root: Path) -> None:
     """The scenes are ahead of the sensor only: with x to the right they stand to the left."""
     spec = pillar_spec(CONFIG)
-    right = findings(inspect_dataset(open_split(root), spec, CONFIG.data), spec, 1)
-    assert not [finding for finding in right if finding.about == "axes"]
-    level = Mounting(axes="y-forward").level
+
+    def found() -> list[Finding]:
+        return findings(inspect_dataset(open_split(root), spec, CONFIG.data), spec, 1)
+
+    right, back = found(), Mounting(axes="y-forward").level.inverse
     for path in (root / "scans").iterdir():
-        write_scan(path, level.inverse.points(read_scan(path).points))
-    turned = [
-        json_line(scan, records_from(level.inverse.boxes(records.boxes), records.types))
-        for scan, records, *_ in list(read_frames(root / "labels.jsonl"))
-    ]
+        write_scan(path, back.points(read_scan(path).points))
+    frames = list(read_frames(root / "labels.jsonl"))
+    turned = [json_line(scan, records_from(back.boxes(own.boxes), own.types)) for scan, own, *_ in frames]
     (root / "labels.jsonl").write_text("".join(turned))
-    wrong = findings(inspect_dataset(open_split(root), spec, CONFIG.data), spec, 1)
-    (text,) = [finding.text for finding in wrong if finding.about == "axes"]
+    (text,) = [finding.text for finding in found() if finding.about == "axes"]
     assert "state the axes, `axes: y,-x,z` in dataset.yaml" in text
     (root / "dataset.yaml").write_text("axes: y,-x,z\n")
-    mended = findings(inspect_dataset(open_split(root), spec, CONFIG.data), spec, 1)
-    assert [finding.about for finding in mended] == [finding.about for finding in right]
+    assert [finding.about for finding in found()] == [finding.about for finding in right]
 
 
-def test_labels_all_around_leave_nothing_out(tmp_path: Path) -> None:
+def test_labels_all_around_leave_nothing_out(root: Path) -> None:
     """Straight behind: rounded to float32, half a turn is more than half a turn."""
-    split = BoxSplit(write_box_dataset(tmp_path / "own", 2))
-    behind = np.array([[-5, 0, 0, 0.1]], np.float32)
+    split, behind = BoxSplit(root), np.array([[-5, 0, 0, 0.1]], np.float32)
     assert split.in_labeled_view("000000", behind).all()
     write_scan(split.scan_path("000000"), behind)
     assert len(split.points("000000", camera_view=True)) == 1

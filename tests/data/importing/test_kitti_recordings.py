@@ -60,40 +60,37 @@ def write_tracking(root: Path) -> Path:
 
 
 def test_tracking(tmp_path: Path) -> None:
-    assert "boxes: Van 2" in invoke(
-        "import", write_tracking(tmp_path / "kitti"), tmp_path / "out", "--from", "kitti-tracking"
-    )
-    split = BoxSplit(tmp_path / "out", "train")
+    """Nothing is labelled behind the car, so that nothing there may be taken for background."""
+    source, out = write_tracking(tmp_path / "kitti"), tmp_path / "out"
+    assert "boxes: Van 2" in invoke("import", source, out, "--from", "kitti-tracking")
+    split = BoxSplit(out, "train")
     assert split.frame_ids == ("0000/000000", "0000/000001")
     assert len(split.labeled_boxes("0000/000000").boxes) == 0
     boxes, types = split.labeled_boxes("0000/000001")
     assert types == ("Van",) and split.records("0000/000001").track_ids == ("7",)
     assert boxes[0].tolist() == pytest.approx([12, 3, -0.7, 4.5, 1.8, 2, 0], abs=1e-4)
-
-
-def test_only_what_is_labelled_is_learnt_from(tmp_path: Path) -> None:
-    """Nothing is labelled behind the car, so that nothing there may be taken for background."""
-    invoke("import", write_tracking(tmp_path / "kitti"), tmp_path / "out", "--from", "kitti-tracking")
-    split = BoxSplit(tmp_path / "out", "train")
-    assert split.has_camera
-    assert len(split.points("0000/000001")) == 80
+    assert split.has_camera and len(split.points("0000/000001")) == 80
     assert len(split.points("0000/000001", camera_view=True)) == 40
     assert len(read_frame(split, "0000/000001", ("Van",)).points) == 40
 
 
-def test_raw(tmp_path: Path) -> None:
-    drive = tmp_path / "2011_09_26" / "2011_09_26_drive_0001_sync"
+def write_drive(root: Path, tracklets: str) -> Path:
     for number in range(3):
-        write_scan(drive / "velodyne_points" / "data" / f"{number:010d}.bin")
-    (drive / "tracklet_labels.xml").write_text(TRACKLETS)
-    imported = read_kitti_raw(tmp_path)
+        write_scan(root / "drive" / "velodyne_points" / "data" / f"{number:010d}.bin")
+    (root / "drive" / "tracklet_labels.xml").write_text(tracklets)
+    return root
+
+
+def test_raw(tmp_path: Path) -> None:
+    source = write_drive(tmp_path, TRACKLETS)
+    imported = read_kitti_raw(source)
     assert [len(frame.records.types) for frame in imported.frames] == [0, 1, 1]
     records = imported.frames[1].records
     assert records.boxes[0].tolist() == pytest.approx([12, 3, -0.7, 4.5, 1.8, 2, 0.4])
     assert records.types == ("Van",) and records.track_ids == ("0",)
     points = np.fromfile(imported.frames[1].scan, "<f4").reshape(-1, 4)
     assert points_in_boxes(points, records.boxes).sum() == 40
-    invoke("import", tmp_path, tmp_path / "out", "--from", "kitti-raw", "--val-share", 0.3)
+    invoke("import", source, tmp_path / "out", "--from", "kitti-raw", "--val-share", 0.3)
     assert BoxSplit(tmp_path / "out", "train").settings.labeled_view_deg == 81
 
 
@@ -102,18 +99,9 @@ def test_sitting_persons_have_the_name_that_training_and_scores_know(tmp_path: P
     tracking = write_tracking(tmp_path / "tracking")
     for path in (tracking / "training" / "label_02").iterdir():
         path.write_text(path.read_text().replace("Van", "Person"))
-    drive = tmp_path / "raw" / "drive"
-    write_scan(drive / "velodyne_points" / "data" / "0000000001.bin")
-    (drive / "tracklet_labels.xml").write_text(TRACKLETS.replace("Van", "Person (sitting)"))
-    for imported in (read_kitti_tracking(tracking), read_kitti_raw(tmp_path / "raw")):
+    raw = write_drive(tmp_path / "raw", TRACKLETS.replace("Van", "Person (sitting)"))
+    for imported in (read_kitti_tracking(tracking), read_kitti_raw(raw)):
         assert {kind for frame in imported.frames for kind in frame.records.types} == {"Person_sitting"}
-
-
-def write_drive(root: Path, tracklets: str) -> Path:
-    for number in range(3):
-        write_scan(root / "drive" / "velodyne_points" / "data" / f"{number:010d}.bin")
-    (root / "drive" / "tracklet_labels.xml").write_text(tracklets)
-    return root
 
 
 ATTRIBUTES = "<!DOCTYPE boost_serialization [<!ATTLIST item x CDATA 'y'>]>"

@@ -75,36 +75,32 @@ def test_tracks_are_kept(tmp_path: Path, tool: str) -> None:
 
 def test_conventions(tmp_path: Path) -> None:
     """One car, 4.1 m long, that looks 1.2 rad to the left of ahead, as each tool states it in its documentation."""
-    geometry = {"position": {"x": 10, "y": 1, "z": -1}, "rotation": {"x": 0, "y": 0, "z": 1.2}}
-    along_x = geometry | {"dimensions": {"x": 4.1, "y": 1.7, "z": 1.5}}
-    along_y = geometry | {
-        "dimensions": {"x": 1.7, "y": 4.1, "z": 1.5},
-        "rotation": {"x": 0, "y": 0, "z": 1.2 - math.pi / 2},
-    }
-    objects = [{"key": "k", "classTitle": "Car", "tags": []}]
-    figure = {"key": "f", "objectKey": "k", "geometryType": "cuboid_3d"}
-    psr = {"position": geometry["position"], "scale": along_x["dimensions"], "rotation": geometry["rotation"]}
-    cloud = {
-        "name": "Car",
-        "centroid": geometry["position"],
-        "dimensions": {"length": 4.1, "width": 1.7, "height": 1.5},
-        "rotations": {"x": 0, "y": 0, "z": math.degrees(1.2)},
-    }
+
+    def vector(x: float, y: float, z: float, keys: tuple[str, str, str] = ("x", "y", "z")) -> dict[str, float]:
+        return dict(zip(keys, (x, y, z), strict=True))
+
+    def sly(size: dict[str, float], yaw: float) -> str:
+        geometry = {"position": vector(10, 1, -1), "dimensions": size, "rotation": vector(0, 0, yaw)}
+        figure = {"key": "f", "objectKey": "k", "geometryType": "cuboid_3d", "geometry": geometry}
+        return json.dumps({"objects": [{"key": "k", "classTitle": "Car", "tags": []}], "figures": [figure]})
+
+    psr = {"position": vector(10, 1, -1), "scale": vector(4.1, 1.7, 1.5), "rotation": vector(0, 0, 1.2)}
+    cloud = {"name": "Car", "centroid": vector(10, 1, -1), "rotations": vector(0, 0, math.degrees(1.2))}
+    cloud |= {"dimensions": vector(4.1, 1.7, 1.5, ("length", "width", "height"))}
     texts = {
         "labelcloud/0.json": json.dumps({"objects": [cloud]}),
         "sustechpoints/label/0.json": json.dumps([{"obj_id": "1", "obj_type": "Car", "psr": psr}]),
-        "supervisely/d/ann/0.pcd.json": json.dumps({"objects": objects, "figures": [figure | {"geometry": along_y}]}),
-        "cvat/ds0/ann/0.pcd.json": json.dumps({"objects": objects, "figures": [figure | {"geometry": along_x}]}),
+        "supervisely/d/ann/0.pcd.json": sly(vector(1.7, 4.1, 1.5), 1.2 - math.pi / 2),
+        "cvat/ds0/ann/0.pcd.json": sly(vector(4.1, 1.7, 1.5), 1.2),
         "openpcdet/labels/0.txt": "10 1 -1 4.1 1.7 1.5 1.2 Car\n",
         "kitti-no-camera/0.txt": "Car 0 0 0 0 0 0 0 1.5 1.7 4.1 10 1 -1 1.2\nDontCare 0 0 0 0 0 0 0 -1 -1 -1 0 0 0 0",
     }
     write_scan(tmp_path / "scans" / "0.bin", np.ones((1, 4), np.float32))
-    for relative, text in texts.items():
-        path = tmp_path / relative
-        path.parent.mkdir(parents=True)
-        path.write_text(text)
     assert {relative.partition("/")[0] for relative in texts} == set(TOOLS)
-    for tool in TOOLS:
+    for relative, text in texts.items():
+        tool = relative.partition("/")[0]
+        (tmp_path / relative).parent.mkdir(parents=True)
+        (tmp_path / relative).write_text(text)
         (frame,) = read(tmp_path / tool, tool).frames
         np.testing.assert_allclose(frame.records.boxes, BOX.astype(np.float32), atol=1e-6, err_msg=tool)
         assert frame.records.types == ("Car",)
@@ -196,18 +192,19 @@ def test_tilted_boxes_are_upright_and_counted(tmp_path: Path) -> None:
 
 
 def test_corrections_are_not_replaced(tmp_path: Path) -> None:
-    write_scan(tmp_path / "scans" / "0.bin", np.ones((1, 4), np.float32))
-    run = tmp_path / "detections.jsonl"
-    run.write_text(json_line(str(tmp_path / "scans" / "0.bin"), records_from(BOX, ["Car"])))
-    folder = write_prelabels(run, "openpcdet", tmp_path)
-    assert (folder / "0.txt").read_text() == "10.0000 1.0000 -1.0000 4.1000 1.7000 1.5000 1.2000 Car\n"
-    run.write_text(json_line(str(tmp_path / "scans" / "0.bin"), records_from(BOX, ["Van"])))
-    write_prelabels(run, "labelcloud", tmp_path)
-    assert "Van" in (write_prelabels(run, "openpcdet", tmp_path) / "0.txt").read_text()
-    (folder / "0.txt").write_text("corrected")
+    scan, run = tmp_path / "scans" / "0.bin", tmp_path / "detections.jsonl"
+    write_scan(scan, np.ones((1, 4), np.float32))
+    run.write_text(json_line(str(scan), records_from(BOX, ["Car"])))
+    label = write_prelabels(run, "openpcdet", tmp_path) / "0.txt"
+    assert label.read_text() == "10.0000 1.0000 -1.0000 4.1000 1.7000 1.5000 1.2000 Car\n"
+    run.write_text(json_line(str(scan), records_from(BOX, ["Van"])))
+    for tool in ("labelcloud", "openpcdet"):
+        write_prelabels(run, tool, tmp_path)
+    assert "Van" in label.read_text()
+    label.write_text("corrected")
     with pytest.raises(OutputError, match=r"0\.txt: was changed or added since .* may hold corrections"):
         write_prelabels(run, "openpcdet", tmp_path)
-    assert (folder / "0.txt").read_text() == "corrected"
+    assert label.read_text() == "corrected"
     require_unchanged(tmp_path, "labelcloud")
     (tmp_path / WRITTEN_FILE).write_text("")
     with pytest.raises(OutputError, match="was changed or added"):

@@ -35,6 +35,9 @@ def root(tmp_path):
 
 
 def test_splits(root):
+    """Hidden files are of a killed writer, or of macOS; Notepad begins a list with a byte-order mark."""
+    for name in (".000001.asca-12345678.bin", "._000002.bin"):
+        (root / "training/velodyne" / name).write_bytes(bytes(16))
     write_image_set(root, "val", ["000010", "000001"])
     write_image_set(root, "test", ["000007"])
     assert KittiSplit(root).frame_ids == ("000001", "000002", "000010")
@@ -42,30 +45,25 @@ def test_splits(root):
     assert KittiSplit(root, "testing").frame_ids == KittiSplit(root, "test").frame_ids == ("000007",)
     assert KittiSplit(root, "val").scan_path("000010") == root / "training/velodyne/000010.bin"
     assert KittiSplit(root, "test").calib_path("000007") == root / "testing/calib/000007.txt"
-
-
-def test_hidden_files_are_no_frames_and_a_byte_order_mark_no_part_of_a_name(root):
-    """Left by a killed writer, or by macOS; Notepad begins a list with the mark."""
-    for name in (".000001.asca-12345678.bin", "._000002.bin"):
-        (root / "training/velodyne" / name).write_bytes(bytes(16))
-    assert KittiSplit(root).frame_ids == ("000001", "000002", "000010")
-    write_image_set(root, "val", ["000001"])
     (root / "ImageSets/val.txt").write_text("000001\n", encoding="utf-8-sig")
     assert KittiSplit(root, "val").frame_ids == ("000001",)
 
 
-def test_missing_parts_of_a_dataset_are_named(root, tmp_path):
-    split = KittiSplit(root)
-    assert_one_line(root / "training/label_2/000001.txt", ["empty file"], lambda: split.objects("000001"))
-    assert_one_line(root / "training/calib/000001.txt", ["calib"], lambda: split.calibration("000001"))
+def test_missing_parts_of_a_dataset_are_named(root):
+    split, nowhere = KittiSplit(root), root / "nowhere"
     write_image_set(root, "val", ["000001", "000003", "000004"])
-    write_image_set(root, "none", [])
-    missing = root / "training/velodyne/000003.bin"
-    assert_one_line(missing, ["2 of 3", "val.txt"], lambda: KittiSplit(root, "val").frame_ids)
-    assert_one_line("none.txt", ["empty"], lambda: KittiSplit(root, "none").frame_ids)
-    assert_one_line("vall.txt", ["none, val", "--split training"], lambda: KittiSplit(root, "vall").frame_ids)
-    nowhere = root / "nowhere"
-    assert_one_line(nowhere / "training/velodyne", ["<root>"], lambda: KittiSplit(nowhere).frame_ids)
+    for name, content in (("none", b""), ("bytes", b"000001\n\xff\xfe\n")):
+        (root / "ImageSets" / f"{name}.txt").write_bytes(content)
+    for place, words, action in (
+        (root / "training/label_2/000001.txt", ["empty file"], lambda: split.objects("000001")),
+        (root / "training/calib/000001.txt", ["calib"], lambda: split.calibration("000001")),
+        (root / "training/velodyne/000003.bin", ["2 of 3", "val.txt"], lambda: KittiSplit(root, "val").frame_ids),
+        ("none.txt", ["empty"], lambda: KittiSplit(root, "none").frame_ids),
+        ("bytes.txt", ["not UTF-8"], lambda: KittiSplit(root, "bytes").frame_ids),
+        ("vall.txt", ["bytes, none, val", "--split training"], lambda: KittiSplit(root, "vall").frame_ids),
+        (nowhere / "training/velodyne", ["<root>"], lambda: KittiSplit(nowhere).frame_ids),
+    ):
+        assert_one_line(place, words, action)
 
 
 def test_scans_of_five_columns_are_stored_as_they_are_read(root):
@@ -98,12 +96,6 @@ def test_labels_stand_all_around_where_the_simulator_says_so(root):
     (root / "simulation.json").write_text("{")
     with pytest.raises(DatasetError, match=r"simulation\.json"):
         _ = KittiSplit(root).has_camera
-
-
-def test_a_list_that_is_not_text_is_named(root):
-    write_image_set(root, "val", [])
-    (root / "ImageSets" / "val.txt").write_bytes(b"000001\n\xff\xfe\n")
-    assert_one_line("val.txt", ["not UTF-8"], lambda: KittiSplit(root, "val").frame_ids)
 
 
 # --- real frames, where there are some

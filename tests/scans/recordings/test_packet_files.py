@@ -23,7 +23,6 @@ from asca_pillars.scans.recordings.point_cloud2 import read_point_cloud
 from asca_pillars.scans.recordings.recorded_scans import RecordedScan, RecordedScans
 from asca_pillars.scans.recordings.recording import Encoding, Message, Recording, Topic
 from asca_pillars.scans.recordings.scan_types import kind_of_scans
-from tests.scans.recordings.cloud_recordings import header, serialized
 
 START_S = 1_700_000_000
 CAPTURES = os.environ.get("ASCA_OUSTER_CAPTURES")
@@ -84,28 +83,31 @@ def test_a_velodyne_is_cut_by_revolution(tmp_path: Path) -> None:
 @pytest.mark.parametrize("encoding", ["cdr", "ros1"])
 def test_packets_of_a_velodyne_in_a_recording(encoding: Encoding) -> None:
     """velodyne_msgs/VelodyneScan: the same points as of a capture of these packets."""
-    types, name, ros1 = typestore(encoding).types, "velodyne_msgs/msg/VelodyneScan", encoding == "ros1"
-    packet, stamp = types["velodyne_msgs/msg/VelodynePacket"], types["builtin_interfaces/msg/Time"]
-    kind = kind_of_scans(name)
+    types = typestore(encoding)
+    stamp = types.types["builtin_interfaces/msg/Time"]
+    head = {"seq": 0} if encoding == "ros1" else {}
+    header = types.types["std_msgs/msg/Header"](stamp=stamp(sec=START_S, nanosec=7), frame_id="velodyne", **head)
+    one = types.types["velodyne_msgs/msg/VelodynePacket"]
+    payloads = vlp16_packets(1, 10.0, 51)
+    packets = [
+        one(stamp=stamp(sec=START_S, nanosec=number * 1_327_000), data=np.frombuffer(payload, np.uint8))
+        for number, payload in enumerate(payloads)
+    ]
+    scan = types.types["velodyne_msgs/msg/VelodyneScan"](header=header, packets=packets)
+    write = types.serialize_ros1 if encoding == "ros1" else types.serialize_cdr
+    data = bytes(write(scan, "velodyne_msgs/msg/VelodyneScan"))
+    kind = kind_of_scans("velodyne_msgs/msg/VelodyneScan")
     assert kind == "Velodyne" == kind_of_scans("velodyne_msgs/VelodyneScan")
-
-    def data(payloads: list[bytes]) -> bytes:
-        packets = [
-            packet(stamp=stamp(sec=START_S, nanosec=number * 1_327_000), data=np.frombuffer(payload, np.uint8))
-            for number, payload in enumerate(payloads)
-        ]
-        head = header(types, START_S * 10**9 + 7, "velodyne", ros1=ros1)
-        return serialized(types[name](header=head, packets=packets), name, ros1=ros1)
-
-    whole = data(vlp16_packets(1, 10.0, 51))
-    cloud = read_point_cloud(Message(1, whole, encoding), "a", kind)
+    cloud = read_point_cloud(Message(1, data, encoding), "a", kind)
     assert (cloud.frame_id, cloud.time_ns) == ("velodyne", START_S * 10**9 + 7)
     assert cloud.points.reflectance is not None and len(cloud.points.xyz) == pytest.approx(28_900, rel=0.02)
     assert np.linalg.norm(cloud.points.xyz, axis=1) == pytest.approx(10, abs=0.2)
     assert cloud.points.reflectance == pytest.approx(0.2)
     with pytest.raises(ScanError, match="no readable point cloud of Velodyne"):
-        read_point_cloud(Message(1, whole[: len(whole) // 2], encoding), "a", kind)
-    assert len(read_point_cloud(Message(1, data([]), encoding), "a", kind).points.xyz) == 0
+        read_point_cloud(Message(1, data[: len(data) // 2], encoding), "a", kind)
+    empty = types.types["velodyne_msgs/msg/VelodyneScan"](header=header, packets=[])
+    data = bytes(write(empty, "velodyne_msgs/msg/VelodyneScan"))
+    assert len(read_point_cloud(Message(1, data, encoding), "a", kind).points.xyz) == 0
 
 
 def test_what_lies_before_a_tear_is_read(tmp_path: Path) -> None:
