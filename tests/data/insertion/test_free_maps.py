@@ -15,6 +15,11 @@ from asca_pillars.scans.scan_reader import read_scan, write_scan
 from tests.data.insertion.simple_streets import street, write_streets
 
 
+@pytest.fixture
+def split(tmp_path: Path) -> KittiSplit:
+    return KittiSplit(write_streets(tmp_path / "data", 1))
+
+
 def load(split: KittiSplit, prepared: Path, frame_id: str = "000000", camera_view: bool = False) -> FreeSpace:
     return load_free_space(split, frame_id, prepared, camera_view=camera_view)
 
@@ -32,8 +37,8 @@ def files(prepared: Path) -> list[Path]:
     return sorted(path for path in prepared.rglob("*.npz"))
 
 
-def test_what_is_read_is_what_was_computed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    split, prepared = KittiSplit(write_streets(tmp_path / "data", 1)), tmp_path / "prepared"
+def test_what_is_read_is_what_was_computed(split: KittiSplit, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    prepared = tmp_path / "prepared"
     computed = find_free_space(read_scan(split.scan_path("000000")).points)
     assert computed.free.any() and len(computed.clusters)
     assert_same(load(split, prepared), computed)
@@ -42,8 +47,8 @@ def test_what_is_read_is_what_was_computed(tmp_path: Path, monkeypatch: pytest.M
     assert len(files(prepared)) == 1 and not list(prepared.rglob(".*"))
 
 
-def test_the_camera_sees_less(tmp_path: Path) -> None:
-    split, prepared = KittiSplit(write_streets(tmp_path / "data", 1)), tmp_path / "prepared"
+def test_the_camera_sees_less(split: KittiSplit, tmp_path: Path) -> None:
+    prepared = tmp_path / "prepared"
     points = read_scan(split.scan_path("000000")).points
     seen = points[in_image(points, split.calibration("000000"))]
     assert len(seen) < len(points)
@@ -52,8 +57,8 @@ def test_the_camera_sees_less(tmp_path: Path) -> None:
     assert len(files(prepared)) == 2
 
 
-def test_another_scan_or_a_damaged_file_is_computed_again(tmp_path: Path) -> None:
-    split, prepared = KittiSplit(write_streets(tmp_path / "data", 1)), tmp_path / "prepared"
+def test_another_scan_or_a_damaged_file_is_computed_again(split: KittiSplit, tmp_path: Path) -> None:
+    prepared = tmp_path / "prepared"
     before = load(split, prepared)
     points = street(7)[0]
     write_scan(split.scan_path("000000"), points)
@@ -67,8 +72,8 @@ def test_another_scan_or_a_damaged_file_is_computed_again(tmp_path: Path) -> Non
         assert_same(load(split, prepared), after)
 
 
-def test_a_scan_without_ground_is_remembered_as_such(tmp_path: Path) -> None:
-    split, prepared = KittiSplit(write_streets(tmp_path / "data", 1)), tmp_path / "prepared"
+def test_a_scan_without_ground_is_remembered_as_such(split: KittiSplit, tmp_path: Path) -> None:
+    prepared = tmp_path / "prepared"
     write_scan(split.scan_path("000000"), np.array([[9, 0, 0, 0.5]], np.float32))
     for _ in range(2):
         space = load(split, prepared)
@@ -87,12 +92,12 @@ def test_all_at_once_is_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     assert [path.read_bytes() for path in at_once] == [path.read_bytes() for path in one_by_one]
 
 
-def test_a_folder_that_cannot_be_written_is_named(tmp_path: Path) -> None:
-    split = KittiSplit(write_streets(tmp_path / "data", 1), "train")
+def test_a_folder_that_cannot_be_written_is_named(split: KittiSplit, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("not a folder")
+    prepared = tmp_path / "file" / "prepared"
     for attempt in (
-        lambda: load(split, tmp_path / "file" / "prepared"),
-        lambda: prepare_free_spaces(split, tmp_path / "file" / "prepared", camera_view=True, workers=1),
+        lambda: load(split, prepared),
+        lambda: prepare_free_spaces(split, prepared, camera_view=True, workers=1),
     ):
         with pytest.raises(DatasetError, match=r"file/prepared/.*: cannot be written.*data\.prepared") as caught:
             attempt()

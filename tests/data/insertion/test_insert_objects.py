@@ -1,6 +1,7 @@
 """Insertion as a whole: which classes, how many, the same for the same seed, and nothing else changed."""
 
 import dataclasses
+import itertools
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ from torch.utils.data import DataLoader
 
 from asca_pillars.base.errors import ConfigError, DatasetError
 from asca_pillars.cli.prepare import prepare
-from asca_pillars.config.tree import DataConfig
+from asca_pillars.config.tree import Config, DataConfig
 from asca_pillars.data.augment import augment
 from asca_pillars.data.frames import LabeledFrame, read_frame, within_ranges
 from asca_pillars.data.insertion.gt_database import ObjectDatabase, prepare_database
@@ -39,6 +40,10 @@ def inserter_of(root: Path, method: str, **insert: object) -> Inserter:
     return open_inserter(KittiSplit(root, "train"), config(method, **insert))
 
 
+def prepared_in(folder: Path, settings_: Config) -> Config:
+    return dataclasses.replace(settings_, data=dataclasses.replace(settings_.data, prepared=str(folder)))
+
+
 def frame_of(root: Path, number: int) -> LabeledFrame:
     return read_frame(KittiSplit(root, "train"), f"{number:06d}", TYPES)
 
@@ -46,6 +51,10 @@ def frame_of(root: Path, number: int) -> LabeledFrame:
 def augmented(inserter: Inserter, root: Path, number: int, seed: int = 0) -> tuple[LabeledFrame, LabeledFrame]:
     before = frame_of(root, number)
     return before, insert_objects(before, inserter, np.random.default_rng((seed, number)))
+
+
+def assert_same(one: LabeledFrame, other: LabeledFrame) -> None:
+    assert np.array_equal(one.points, other.points) and np.array_equal(one.boxes, other.boxes)
 
 
 def polygons(boxes: np.ndarray) -> list[Polygon]:
@@ -70,29 +79,32 @@ def test_shares_fill_the_classes_up_to_one_level(pairs: list[tuple[float, float]
     assert (after[~filled] >= after[filled].min() - 1e-6 * after.max()).all()
 
 
-def test_shares_by_hand() -> None:
-    # 4 + 1 + 0 objects and 6 more make 11; the car's 4 exceed a third: the others share 7, 3.5 each.
-    assert insertion_shares(np.array([4.0, 1.0, 0.0]), np.ones(3), 6) * 6 == pytest.approx([0, 2.5, 3.5])
-    # Twice as many pedestrians as of the others: 11 = 2.75 + 5.5 + 2.75, but there are 4 cars; 7 = 4.67 + 2.33.
-    assert insertion_shares(np.array([4.0, 1.0, 0.0]), np.array([1, 2, 1.0]), 6) * 6 == pytest.approx(
-        [0, 11 / 3, 7 / 3]
-    )
+@pytest.mark.parametrize(
+    ("wanted", "added"),
+    [
+        # 4 + 1 + 0 objects and 6 more make 11; the car's 4 exceed a third: the others share 7, 3.5 each.
+        ([1, 1, 1], [0, 2.5, 3.5]),
+        # Twice as many pedestrians as of the others: 11 = 2.75 + 5.5 + 2.75, but there are 4 cars; 7 = 4.67 + 2.33.
+        ([1, 2, 1], [0, 11 / 3, 7 / 3]),
+    ],
+)
+def test_shares_by_hand(wanted: list[float], added: list[float]) -> None:
+    shares = insertion_shares(np.array([4.0, 1.0, 0.0]), np.array(wanted, float), 6)
+    assert shares * 6 == pytest.approx(added)
 
 
 @pytest.mark.parametrize("method", METHODS)
 def test_what_is_inserted_touches_nothing(root: Path, method: str) -> None:
     inserter = inserter_of(root, method, objects=8)
     inserted = 0
-    for number in range(FRAMES):
-        for seed in range(5):
-            before, after = augmented(inserter, root, number, seed)
-            new = polygons(after.boxes[len(before.boxes) :])
-            others = polygons(before.boxes)
-            if method == "rs_aug":
-                others += polygons(inserter.free_space(before.frame_id).clusters)
-            assert not any(one.intersection(other).area > 1e-6 for one in new for other in others)
-            assert not any(a.intersection(b).area > 1e-6 for i, a in enumerate(new) for b in new[:i])
-            inserted += len(new)
+    for number, seed in itertools.product(range(FRAMES), range(5)):
+        before, after = augmented(inserter, root, number, seed)
+        new, others = polygons(after.boxes[len(before.boxes) :]), polygons(before.boxes)
+        if method == "rs_aug":
+            others += polygons(inserter.free_space(before.frame_id).clusters)
+        assert not any(one.intersection(other).area > 1e-6 for one in new for other in others)
+        assert not any(a.intersection(b).area > 1e-6 for a, b in itertools.combinations(new, 2))
+        inserted += len(new)
     assert inserted > 2 * FRAMES * 5
 
 
@@ -125,7 +137,7 @@ def test_objects_of_gt_aug_stand_where_they_stood(root: Path) -> None:
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_other_types_are_in_the_way_too(root: Path, tmp_path: Path, method: str) -> None:
+def test_other_types_are_in_the_way_too(tmp_path: Path, method: str) -> None:
     """A lorry, which is no class, stands over the whole street: there is no room for anything."""
     split = KittiSplit(write_streets(tmp_path, 2), "train")
     inserter = open_inserter(split, config(method))
@@ -134,7 +146,7 @@ def test_other_types_are_in_the_way_too(root: Path, tmp_path: Path, method: str)
     write_labels(split.label_path("000000"), [lorry])
     before, after = augmented(inserter, tmp_path, 0)
     assert len(boxes_from_objects([lorry], split.calibration("000000"))) == 1 and len(before.boxes) == 0
-    assert np.array_equal(before.points, after.points) and len(after.boxes) == 0
+    assert_same(before, after)
 
 
 @pytest.mark.parametrize(
@@ -146,10 +158,9 @@ def test_counts_approach_the_proportions(
 ) -> None:
     inserter = inserter_of(root, "rs_aug", objects=4, proportions=proportions)
     before, after = np.zeros(3), np.zeros(3)
-    for number in range(FRAMES):
-        for seed in range(8):
-            for counts, frame in zip((before, after), augmented(inserter, root, number, seed), strict=True):
-                counts += np.bincount(frame.labels[frame.labels >= 0], minlength=3)
+    for number, seed in itertools.product(range(FRAMES), range(8)):
+        for counts, frame in zip((before, after), augmented(inserter, root, number, seed), strict=True):
+            counts += np.bincount(frame.labels[frame.labels >= 0], minlength=3)
     if expected is None:  # the class that was not asked for stays as it is
         assert after[1] == before[1] and after[2] > 1.5 * before[2]
         return
@@ -160,41 +171,27 @@ def test_counts_approach_the_proportions(
 
 @pytest.mark.parametrize("method", METHODS)
 def test_samples_depend_on_seed_epoch_and_frame_alone(root: Path, method: str) -> None:
-    frames = open_dataset(root, config(method), training=True)
-    again = open_dataset(root, config(method), training=True)
-    late = [again.sample(epoch, number).frame for epoch, number in ((1, 3), (0, 3), (0, 2))][1:]
-    for sample, number in zip(late, (3, 2), strict=True):
-        expected = frames.sample(0, number).frame
-        assert np.array_equal(sample.points, expected.points) and np.array_equal(sample.boxes, expected.boxes)
-    first, second = frames.sample(0, 3).frame, frames.sample(1, 3).frame
-    assert len(first.points) != len(second.points) or not np.array_equal(first.points, second.points)
-
-
-@pytest.mark.parametrize("method", METHODS)
-def test_from_an_epoch_on_nothing_is_inserted(root: Path, method: str) -> None:
-    always, early, never = (
+    """Not on the order in which they are asked for, as by a run that resumes; from an epoch on nothing is inserted."""
+    always, again, early, never = (
         open_dataset(root, settings_, training=True)
-        for settings_ in (config(method), config(method, disable_after_epoch=2), config("none"))
+        for settings_ in (config(method), config(method), config(method, disable_after_epoch=2), config("none"))
     )
-    for epoch in range(4):
-        # Which is why the order in which samples are asked for, as by a run that resumes, does not matter.
+    again.sample(1, 3)
+    for number in (3, 2):
+        assert_same(again.sample(0, number).frame, always.sample(0, number).frame)
+    for epoch, number in itertools.product(range(4), (3, 2)):
         like = always if epoch < 2 else never
-        for number in (3, 2):
-            sample, expected = early.sample(epoch, number).frame, like.sample(epoch, number).frame
-            assert np.array_equal(sample.points, expected.points) and np.array_equal(sample.boxes, expected.boxes)
+        assert_same(early.sample(epoch, number).frame, like.sample(epoch, number).frame)
+    first, second = always.sample(0, 3).frame, always.sample(1, 3).frame
+    assert len(first.points) != len(second.points) or not np.array_equal(first.points, second.points)
     assert len(early.sample(1, 3).frame.boxes) > len(early.sample(2, 3).frame.boxes)
 
 
 def test_any_number_of_workers_gives_the_same(root: Path) -> None:
     frames = open_dataset(root, config("rs_aug"), training=True)
     batches = [[(0, number), (1, number)] for number in range(FRAMES)]
-    loader = DataLoader(
-        frames,
-        batch_sampler=batches,
-        num_workers=2,
-        collate_fn=Collate(frames.preparation),
-        multiprocessing_context=loader_context(),
-    )
+    options = {"collate_fn": Collate(frames.preparation), "multiprocessing_context": loader_context()}
+    loader = DataLoader(frames, batch_sampler=batches, num_workers=2, **options)
     for batch, indices in zip(loader, batches, strict=True):
         for boxes, labels, index in zip(batch.boxes, batch.labels, indices, strict=True):
             expected = frames.sample(*index).frame
@@ -203,17 +200,15 @@ def test_any_number_of_workers_gives_the_same(root: Path) -> None:
 
 def test_without_insertion_everything_is_as_before(root: Path, tmp_path: Path) -> None:
     """Neither method `none` nor 0 objects changes what else is drawn, and no folder is made for `none`."""
-    plain = config("none")
-    folder = tmp_path / "prepared"
-    plain = dataclasses.replace(plain, data=dataclasses.replace(plain.data, prepared=str(folder)))
+    plain = prepared_in(tmp_path / "prepared", config("none"))
     rng = np.random.default_rng((plain.train.seed, 2, 4))
     frame = within_ranges(augment(frame_of(root, 4), plain.augment, rng), SPEC.grid.ranges)
     pillars = SPEC.pillarize(frame.points)
     for settings_ in (plain, config("rs_aug", objects=0), config("gt_aug", objects=0)):
         sample = open_dataset(root, settings_, training=True).sample(2, 4)
-        assert np.array_equal(sample.frame.points, frame.points) and np.array_equal(sample.frame.boxes, frame.boxes)
+        assert_same(sample.frame, frame)
         assert np.array_equal(sample.prepared.pillars.features, pillars.features)
-    assert not folder.exists()
+    assert not (tmp_path / "prepared").exists()
 
 
 def test_validation_frames_get_nothing(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -225,11 +220,9 @@ def test_validation_frames_get_nothing(root: Path, monkeypatch: pytest.MonkeyPat
 def test_a_frame_without_ground_or_points_stays_as_it_is(tmp_path: Path) -> None:
     split = KittiSplit(write_streets(tmp_path, 3), "train")
     inserter = open_inserter(split, config("rs_aug"))
-    write_scan(split.scan_path("000000"), np.array([[9, 0, 0, 0.5]], np.float32))
-    write_scan(split.scan_path("000001"), np.array([[-9, 0, 0, 0.5]], np.float32))
-    for number in (0, 1):
-        before, after = augmented(inserter, tmp_path, number)
-        assert np.array_equal(before.points, after.points) and np.array_equal(before.boxes, after.boxes)
+    for number, x in enumerate((9, -9)):
+        write_scan(split.scan_path(f"00000{number}"), np.array([[x, 0, 0, 0.5]], np.float32))
+        assert_same(*augmented(inserter, tmp_path, number))
 
 
 def test_a_class_without_objects_is_named(tmp_path: Path) -> None:
@@ -271,20 +264,14 @@ def test_the_database_is_built_by_as_many_processes_as_load(root: Path, monkeypa
 def test_prepare_leaves_nothing_for_training_to_compute(
     root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    path = tmp_path / "model.yaml"
+    path, folder = tmp_path / "model.yaml", tmp_path / "prepared"
     path.write_text("augment: {insert: {method: rs_aug}}")
-    overrides = [f"data.prepared={tmp_path / 'prepared'}"]
-    prepare(path, data=root, override=overrides, workers=1)
+    prepare(path, data=root, override=[f"data.prepared={folder}"], workers=1)
     assert f"{4 * FRAMES} objects of {FRAMES} frames" in capsys.readouterr().out
-    made = {file: file.stat().st_mtime_ns for file in (tmp_path / "prepared").rglob("*.n*")}
+    made = {file: file.stat().st_mtime_ns for file in folder.rglob("*.n*")}
     assert len(made) == FRAMES + 2
-    find = "asca_pillars.data.insertion.free_space.find_free_space"
-    monkeypatch.setattr(find, lambda _: pytest.fail("computed again"))
-    monkeypatch.setattr("asca_pillars.data.insertion.gt_database._build", lambda *_: pytest.fail("built again"))
-    settings_ = config("rs_aug")
-    settings_ = dataclasses.replace(
-        settings_, data=dataclasses.replace(settings_.data, prepared=str(tmp_path / "prepared"))
-    )
-    frames = open_dataset(root, settings_, training=True)
+    for name in ("free_space.find_free_space", "gt_database._build"):
+        monkeypatch.setattr(f"asca_pillars.data.insertion.{name}", lambda *_: pytest.fail("again"))
+    frames = open_dataset(root, prepared_in(folder, config("rs_aug")), training=True)
     assert all(len(frames.sample(0, number).frame.boxes) for number in range(FRAMES))
     assert {file: file.stat().st_mtime_ns for file in made} == made
