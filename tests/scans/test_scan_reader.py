@@ -1,14 +1,23 @@
 """Every scan format, written here byte by byte, and what damaged files say."""
 
+import struct
+import time
+import warnings
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from asca_pillars.base.errors import ScanError
+from asca_pillars.scans import scan_reader
+from asca_pillars.scans.arrays import points_from_array
 from asca_pillars.scans.find_scans import SCAN_SUFFIXES
+from asca_pillars.scans.ply import MAX_LISTS
 from asca_pillars.scans.scan_reader import decide_scale, read_scan, write_scan
-from tests.scans.scan_files import POINTS, npy, pcd, ply, read
+from asca_pillars.scans.stored_scans import folder_reflectance_scale
+from tests.scans.scan_files import POINTS, literal_lzf, npy, pcd, ply, read
 
 FILES = {
     "a.bin": POINTS.astype("<f4").tobytes(),
@@ -217,3 +226,210 @@ def test_what_is_written_is_read(tmp_path):
     ):
         with pytest.raises(error, match=message):
             write_scan(tmp_path / name, points)
+
+
+# --- well-formed files that are not what they seem
+
+
+RNG = np.random.default_rng(0)
+STREET = np.column_stack([RNG.uniform(-60, 60, (4000, 2)), RNG.uniform(-2, 3, 4000), RNG.beta(1, 3, 4000)]).astype("f4")
+NUSCENES = np.column_stack([STREET, RNG.integers(0, 32, 4000)]).astype("f4")
+
+
+def ascii_pcd(*rows: str, fields: str = "x y z i") -> bytes:
+    width = len(fields.split())
+    header = f"FIELDS {fields}\nSIZE{' 4' * width}\nTYPE{' F' * width}\nPOINTS {len(rows)}\nDATA ascii"
+    return "\n".join([header, *rows, ""]).encode()
+
+
+# --- what would take minutes or gigabytes
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "words"),
+    {
+        "many words in POINTS": ("a.pcd", pcd("ascii").replace(b"POINTS 4", b"POINTS" + b" 9" * 20_000), "POINTS is"),
+        "a million fields": ("a.pcd", pcd("ascii").replace(b"normal", b"n " * 1_000_000), "no DATA line within"),
+        "LZF bomb": (
+            "a.pcd",
+            pcd("binary_compressed")[:-120] + struct.pack("<2I", 20_000_002, 16) + b"\x00a" + b"\xe0\xff\x00" * 9**7,
+            "unpacked bytes where",
+        ),
+        "many elements": ("a.ply", ply("ascii").replace(b"element camera", b"element c 1\n" * 9999), "no PLY header"),
+        "empty lists": (
+            "a.ply",
+            ply("binary_little_endian").replace(b"strip 2", b"strip 100000000000000000"),
+            f"at most {MAX_LISTS}",
+        ),
+        "many lines": ("a.ply", ply("ascii").replace(b"strip 2", b"strip 100000000000000000"), "0 lines where"),
+    }.values(),
+)
+def test_bombs_are_refused_at_once(tmp_path, name, content, words):
+    start = time.process_time()
+    with pytest.raises(ScanError, match=words):
+        read(tmp_path, name, content)
+    assert time.process_time() - start < 10  # a minute and more before; no bar on speed
+
+
+def test_an_lzf_stream_is_followed_no_further_than_the_points_need(tmp_path):
+    content = pcd("binary_compressed")
+    start = content.index(b"DATA binary_compressed\n") + len(b"DATA binary_compressed\n")
+    stream = literal_lzf(bytes(108)) + b"\xe0\xff\x00" * 1_000_000  # 264 bytes each
+    packed = struct.pack("<2I", len(stream), 108) + stream
+    with pytest.raises(ScanError, match=r"\d{3} or more bytes instead of 108"):
+        read(tmp_path, "a.pcd", content[:start] + packed)
+
+
+def test_a_feather_file_that_unpacks_to_gigabytes_is_refused_before_it_is_read(tmp_path):
+    feather = pytest.importorskip("pyarrow.feather")
+    import pyarrow
+
+    zeros = np.zeros(2**23 + 1, np.uint8)
+    columns = dict.fromkeys(("x", "y", "z", "intensity"), zeros)
+    feather.write_feather(pyarrow.table(columns), tmp_path / "1.feather", compression="zstd")
+    with pytest.raises(ScanError, match=r"1\.feather: 8388609 rows, at most 8388608 are read"):
+        read_scan(tmp_path / "1.feather")
+
+
+def test_files_with_too_many_points_are_refused_before_they_are_read(tmp_path, monkeypatch):
+    with (tmp_path / "a.bin").open("wb") as file:
+        file.truncate(40 * 10**9)
+    with pytest.raises(ScanError, match=r"a\.bin: 40000000000 bytes"):
+        read_scan(tmp_path / "a.bin")
+    monkeypatch.setattr(scan_reader, "MAX_POINTS", 3)
+    with pytest.raises(ScanError, match="more than 3 points"):
+        read(tmp_path, "b.bin", POINTS.tobytes())
+
+
+def test_a_file_that_does_not_fit_into_memory_is_an_error_of_one_line(tmp_path, monkeypatch):
+    def too_little(*_: object, **__: object) -> None:
+        raise MemoryError
+
+    monkeypatch.setattr(np, "fromfile", too_little)
+    with pytest.raises(ScanError, match="64 bytes do not fit into memory"):
+        read(tmp_path, "a.bin", POINTS.tobytes())
+
+
+# --- shifted columns
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "words"),
+    [
+        ("a.pcd", ascii_pcd("1 2 3", "1 2 3 .4", "1 2 3 .4 5"), "point 0 has 3 values where the fields need 4"),
+        ("a.pcd", ascii_pcd("1 2 3 .4 5", fields="x y z i x"), "2 fields x"),
+        ("a.ply", ply("ascii").replace(b" 70.125 1.0\n", b" 70.125\n"), "point 1 has 4 values where the fields need 5"),
+    ],
+)
+def test_a_line_with_a_value_too_few_or_too_many_shifts_nothing(tmp_path, name, content, words):
+    with pytest.raises(ScanError, match=words):
+        read(tmp_path, name, content)
+
+
+# --- the scale of reflectance
+
+
+def test_one_bright_point_does_not_darken_a_scan(tmp_path):
+    points = STREET.copy()
+    points[5, 3] = 1.02
+    for name, content in (("a.bin", points.tobytes()), ("a.npy", npy(points)), ("a.pcd", pcd("binary", points))):
+        scan = read(tmp_path, name, content)
+        np.testing.assert_allclose(scan.points[:, 3], np.minimum(points[:, 3], 1))
+        assert (scan.notes.reflectance_scale, scan.notes.clipped_reflectances) == (1, 1)
+
+
+@pytest.mark.parametrize("scale", [1, 255, 65535])
+def test_scales_are_found_and_reported(tmp_path, scale):
+    scan = read(tmp_path, "a.bin", (STREET * np.array([1, 1, 1, scale], np.float32)).tobytes())
+    np.testing.assert_allclose(scan.points, STREET, atol=1e-6)
+    assert scan.notes.reflectance_scale == scale
+    assert scan.notes.remarks == ()
+
+
+def test_a_scale_of_100_is_doubted_and_can_be_stated(tmp_path):
+    (tmp_path / "a.bin").write_bytes((STREET * np.array([1, 1, 1, 100], np.float32)).tobytes())
+    assert "0..100" in read_scan(tmp_path / "a.bin").notes.remarks[0]
+    scan = read_scan(tmp_path / "a.bin", reflectance_scale=100)
+    np.testing.assert_allclose(scan.points, STREET, atol=1e-6)
+    assert scan.notes.remarks == ()
+    wrongs: tuple[Any, ...] = (0, -1, float("nan"), "bright")
+    for wrong in wrongs:
+        with pytest.raises(ScanError, match="reflectance_scale"):
+            read_scan(tmp_path / "a.bin", reflectance_scale=wrong)
+
+
+def test_a_folder_has_one_scale(tmp_path):
+    """A dark scan, nothing above 1 of 255, among brighter ones."""
+    for number, brightness in enumerate([255, 255, 1, 255]):
+        points = STREET * np.array([1, 1, 1, brightness], np.float32)
+        (tmp_path / f"{number}.bin").write_bytes(points.tobytes())
+    paths = sorted(tmp_path.iterdir())
+    assert read_scan(paths[2]).notes.reflectance_scale == 1
+    (tmp_path / "9.bin").write_bytes(b"damaged")
+    scale, doubt = folder_reflectance_scale([*paths, tmp_path / "9.bin"])
+    assert (scale, doubt) == (255, None)
+    assert read_scan(paths[2], reflectance_scale=scale).points[:, 3].max() <= 1 / 255
+
+
+# --- columns
+
+
+@pytest.mark.parametrize(
+    ("stored", "said"),
+    {
+        "five": (NUSCENES, True),
+        "five, no whole number of four": (NUSCENES[:3999], True),
+        "five, rings left out by an exporter": (NUSCENES * np.array([1, 1, 1, 1, 0], np.float32), True),
+        "four": (STREET, False),
+    }.values(),
+)
+def test_four_or_five_columns_are_found_and_five_are_said(tmp_path, stored, said):
+    scan = read(tmp_path, "a.bin", stored.tobytes())
+    np.testing.assert_array_equal(scan.points, stored[:, :4])
+    assert ["5 columns" in remark for remark in scan.notes.remarks] == [True] * said
+
+
+def test_columns_can_be_stated_and_are_asked_for_where_both_fit(tmp_path):
+    (tmp_path / "a.bin").write_bytes(NUSCENES.tobytes())
+    np.testing.assert_array_equal(read_scan(tmp_path / "a.bin", columns=5).points, STREET)
+    assert len(read_scan(tmp_path / "a.bin", columns=4).points) == 5000
+    (tmp_path / "b.bin").write_bytes(np.ascontiguousarray(STREET[:, :3]).tobytes())
+    scan = read_scan(tmp_path / "b.bin", columns=3)
+    np.testing.assert_array_equal(scan.points, STREET * np.array([1, 1, 1, 0], np.float32))
+    assert scan.notes.reflectance_scale is None
+    for wrong, words in ((7, "7 columns"), (2, "3 to 16"), (17, "3 to 16")):
+        with pytest.raises(ScanError, match=words):
+            read_scan(tmp_path / "a.bin", columns=wrong)
+    with pytest.raises(ScanError, match=r"four columns .* or five .*state which"):
+        read(tmp_path, "c.bin", np.arange(80, dtype="<f4").tobytes())
+
+
+# --- arrays
+
+
+def test_python_says_nothing_of_a_damaged_npy_header(tmp_path):
+    """NumPy reads it as Python source, of which Python has opinions that users would see."""
+    content = npy(POINTS.astype("<f4")).replace(b"'<f4', ", rb"'<f\d',")
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        with pytest.raises(ScanError, match="not an array of numbers"):
+            read(tmp_path, "a.npy", content)
+    assert [str(one.message) for one in said] == []
+
+
+def test_arrays_on_their_side_are_refused(tmp_path):
+    for rows in (3, 4):
+        with pytest.raises(ScanError, match="transpose it"):
+            read(tmp_path, "a.npy", npy(np.ascontiguousarray(STREET.T[:rows])))
+
+
+@pytest.mark.parametrize("dtype", ["c8", "U3", "M8[s]", "?", "O"])
+def test_other_things_than_real_numbers_are_refused(dtype):
+    with pytest.raises(ScanError, match="real numbers"):
+        points_from_array(np.zeros((5, 4), dtype))
+
+
+def test_masked_points_are_left_out_and_counted():
+    stored = points_from_array(np.ma.masked_greater(POINTS, 30))
+    np.testing.assert_array_equal(stored.xyz, np.delete(POINTS[:, :3], 1, axis=0))
+    assert stored.remarks == ("1 masked points left out",)

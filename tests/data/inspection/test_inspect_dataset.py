@@ -1,6 +1,7 @@
 """What `asca inspect` measures, against plain loops and the training loader; and what it says of data gone wrong."""
 
 import dataclasses
+import json
 import math
 import re
 import subprocess
@@ -14,12 +15,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from asca_pillars.base.schema import to_dict
-from asca_pillars.config.pillar import PillarModel
+from asca_pillars.cli.inspect import inspect
+from asca_pillars.config.pillar import LossConfig, PillarModel
 from asca_pillars.config.tree import Config, pillar_spec
 from asca_pillars.data.frames import LabeledFrame
 from asca_pillars.data.inspection.measurements import MatchOutcome, match, measure_frame, measure_scan
 from asca_pillars.data.kitti import KittiSplit, read_labels
 from asca_pillars.detection.anchors import IGNORED
+from asca_pillars.detection.targets import assign_targets
 from asca_pillars.geometry.overlap import aligned_bev_iou
 from asca_pillars.ops.pillar.prepare import PillarLimits
 from asca_pillars.scans.scan_reader import read_scan
@@ -260,3 +263,58 @@ def test_axes_of_a_layout_that_cannot_state_them(data: Path) -> None:
     change_scans(data, turn_upside_down)
     texts = [item.text for item in found(data) if "scans are odd" in item.text]
     assert texts and texts[0].endswith("turn the points of all scans to x forward, y left, z up, and calib with them")
+
+
+# --- reflectances: of those that reading changes, and only of them
+
+
+@pytest.mark.parametrize(
+    ("scale", "every", "message"),
+    [
+        (255, 1, r"divided by 255 when read: training sees 0 to 0\.\d+; divide it by its full scale"),
+        (100, 1, r"training sees 0 to 0\.3\d; divide it by its full scale"),
+        (255, 2, r"in 6 of 12 scans, which are divided by 255; .* store all of them as 0\.\.1"),
+        (65535, 1, r"divided by 65535 when read: training sees 0 to 0\.\d+; divide it by its full scale"),
+        (65535, 2, r"in 6 of 12 scans, which are divided by 65535; the others are taken as 0\.\.1"),
+        (1.5, 1, r"cut off at 1 in \d+\.\d % of the points; divide it by its full scale"),
+        (0, 1, r"0 everywhere; check what exported"),
+        (1 / 255, 1, r"reaches 0\.00\d+ only; store it as 0\.\.1"),
+        (-1, 1, r"goes down to -0\.\d+ and is cut off at 0"),
+    ],
+)
+def test_reflectance_on_another_scale(data: Path, scale: float, every: int, message: str) -> None:
+    change_scans(data, lambda points: np.multiply(points[:, 3], scale, out=points[:, 3]), every)
+    finding = found(data)[0]
+    assert finding.level == "warning" and finding.about == "reflectance" and re.search(message, finding.text)
+
+
+@pytest.mark.parametrize("speck", [1.02, 40.0, 300.0])
+def test_a_speck_of_reflectance_is_none_that_reading_minds(data: Path, speck: float) -> None:
+    change_scans(data, lambda points: points.__setitem__((0, 3), speck), every=4)
+    assert found(data) == []
+
+
+# --- anchors that are matched without thresholds (`model.loss.assigner: atss`)
+
+
+def test_outcomes_by_hand_without_thresholds() -> None:
+    """A short car, which no anchor overlaps by positive_iou, and tiny boxes that have the same best anchors."""
+    x, y = SPEC.anchors[20, 15, 0, :2]
+    boxes = np.array([[x, y, -1.0, 2.0, 1.6, 1.56, 0.0]] + [[x, y + 5, -0.6, 0.3, 0.3, 1.7, 0.0]] * 2, np.float32)
+    frame = LabeledFrame("0", np.empty((0, 4), np.float32), boxes, np.array([0, 1, 1]))
+    outcomes, positives = match(frame, SPEC, "atss")
+    assert outcomes.tolist() == [MatchOutcome.OVERLAPPED, MatchOutcome.MISSED, MatchOutcome.OVERLAPPED]
+    targets = assign_targets(SPEC.anchors, SPEC.classes, boxes, frame.labels, "atss")
+    assert positives.tolist() == np.bincount(frame.labels[targets.matched], minlength=3).tolist()
+
+
+def test_the_command_counts_the_positives_of_the_training_loader(clean: Path, tmp_path: Path) -> None:
+    config = dataclasses.replace(CONFIG, model=PillarModel(spec=SPEC, loss=LossConfig(assigner="atss")))
+    path, report = tmp_path / "config.yaml", tmp_path / "report.json"
+    path.write_text(yaml.safe_dump(to_dict(config)))
+    inspect(clean, config=path, json=report)
+    frames = open_dataset(clean, config, training=False)
+    states = np.stack([frames.sample(0, number).prepared.targets.state for number in range(FRAMES)])
+    for index, facts in enumerate(json.loads(report.read_text())["classes"]):
+        assert facts["positives"] == (states[..., 2 * index : 2 * index + 2] == 1).sum() > 0
+        assert facts["forced"] == 0
