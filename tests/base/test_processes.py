@@ -142,12 +142,6 @@ def test_processes_end_with_the_one_that_started_them(tmp_path: Path) -> None:
         main.communicate(timeout=30)  # until the last process that could write there has ended
 
 
-def test_the_job_is_sent_once(tmp_path: Path) -> None:
-    job = Noting(tmp_path)
-    assert list(map_in_processes(job, range(8), 2, "Noting", at_once=1, progress=False)) == [0, 1, 2, 3, 4, 5, 6, 7]
-    assert len(list(tmp_path.iterdir())) == 2
-
-
 class Noting:
     """A job that leaves a file where it is unpickled."""
 
@@ -167,3 +161,9 @@ class Noting:
 def noted(folder: Path) -> Noting:
     (folder / str(os.getpid())).touch(exist_ok=False)
     return Noting(folder)
+
+
+def test_the_job_is_sent_once(tmp_path: Path) -> None:
+    job = Noting(tmp_path)
+    assert list(map_in_processes(job, range(8), 2, "Noting", at_once=1, progress=False)) == [*range(8)]
+    assert len(list(tmp_path.iterdir())) == 2
