@@ -44,13 +44,6 @@ def refusal(data: dict[str, Any]) -> str:
     return str(caught.value)
 
 
-def test_nested_data_becomes_dataclasses() -> None:
-    data = {"name": "van", "engine": {"power_kw": 60}, "wheels": [{"radius_m": 0.3}, {"radius_m": 0.4, "spokes": 8}]}
-    vehicle = parse(Vehicle, data, "car.yaml")
-    assert vehicle == Vehicle("van", Engine(60.0), wheels=(Wheel(0.3), Wheel(0.4, 8)))
-    assert isinstance(vehicle.engine.power_kw, float)
-
-
 WHEEL = {"radius_m": 0.3}
 
 
@@ -59,12 +52,9 @@ WHEEL = {"radius_m": 0.3}
     [
         ({"nam": "van"}, "unknown key `nam`; did you mean `name`?"),
         ({"engine": {"powr_kw": 3}}, "unknown key `engine.powr_kw`; did you mean `power_kw`?"),
-        ({"spare": {"power": 3}}, "unknown key `spare.power`; did you mean `power_kw`?"),
         ({"wheels": [WHEEL, WHEEL | {"spoke": 8}]}, "unknown key `wheels.1.spoke`; did you mean `spokes`?"),
-        ({"wheels": [{"radus_m": 0.3}]}, "unknown key `wheels.0.radus_m`; did you mean `radius_m`?"),
         ({"engine": {"zzz": 3}}, "unknown key `engine.zzz`; known keys: power_kw"),
         ({"wheels[0]": 1}, "unknown key `wheels[0]`; did you mean `wheels`?"),
-        ({"engine": {"[key]": 1}}, "unknown key `engine.[key]`; known keys: power_kw"),
         ({"wheels": [{"spokes": 3}]}, "missing key `wheels.0.radius_m`"),
         ({"span_m": [1.0]}, "missing key `span_m.1`"),
         ({"engine": {"power_kw": "strong"}}, "`engine.power_kw` = 'strong': input should be a valid number"),
@@ -87,7 +77,7 @@ def test_a_misspelt_key_is_told_before_what_it_leaves_missing() -> None:
     assert "`nme`" in refusal({"nme": "van", "engine": {"power_kw": "strong"}})
 
 
-def test_round_trip() -> None:
+def test_nested_data_becomes_dataclasses_and_back() -> None:
     vehicle = Vehicle("van", Engine(60.0), Engine(1.0), (Wheel(0.3), Wheel(0.4, 8)), (1.0, 2.0), {"a": "b"})
     plain = to_dict(vehicle)
     assert plain == {
@@ -99,6 +89,8 @@ def test_round_trip() -> None:
         "notes": {"a": "b"},
     }
     assert parse(Vehicle, plain, "car.yaml") == vehicle
+    whole = parse(Vehicle, {"name": "van", "engine": {"power_kw": 60}, "wheels": [{"radius_m": 1}]}, "car.yaml")
+    assert whole == Vehicle("van", Engine(60.0), wheels=(Wheel(1.0),)) and isinstance(whole.engine.power_kw, float)
 
 
 @dataclass(frozen=True)

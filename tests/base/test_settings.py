@@ -35,8 +35,6 @@ def test_overrides_win(tmp_path: Path) -> None:
     ("override", "message"),
     [
         ("train.epoch=3", "unknown key `train.epoch`; did you mean `epochs`?"),
-        ("trian.epochs=3", "unknown key `trian`; did you mean `train`?"),
-        ("model.spec.grid.zone=2", "unknown key `model.spec.grid.zone`; did you mean `zones`?"),
         ("epochs=3", "unknown key `epochs`; known keys: name, model"),
         ("train.epochs", "`train.epochs`: an override is written key.subkey=value, such as train.epochs=20"),
         ("=3", "an override is written key.subkey=value"),
@@ -46,7 +44,6 @@ def test_overrides_win(tmp_path: Path) -> None:
         ("train.epochs=[", "`train.epochs=[`: the value is not valid YAML"),
         ("name=2026-99-99", "`name=2026-99-99`: the value is not valid YAML"),
         ("train.epochs=0", "train.epochs = 0: must be at least 1"),
-        ("train.precision=64", "`train.precision` = 64: input should be 'auto', 'fp32' or 'bf16'"),
         ("model.spec.grid.zones=9", "zones 9 must lie between 1 and 5"),
     ],
 )
@@ -64,11 +61,7 @@ def test_overrides_that_cannot_be(tmp_path: Path, override: str, message: str) -
         ("- train\n- model\n", "expected `key: value` lines, found a list"),
         ("just words\n", "expected `key: value` lines, found a str"),
         ("train:\n", "`train` = None: input should be a dictionary"),
-        ("model: {network: {block_channels: [64, 128]}}\n", "missing key `model.network.block_channels.2`"),
-        ("model: {network: {cpa: chanel}}\n", "`model.network.cpa` = 'chanel': input should be 'none'"),
         ("model: {spec: {grid: {zones: 9}}}\n", "zones 9 must lie between 1 and 5"),
-        ("model: {spec: {grid: {x_range_m: [0, 70]}}}\n", "x_range_m [0, 70] must be a multiple of 7.68 m"),
-        ("model: {spec: {classes: []}}\n", "classes is empty"),
     ],
 )
 def test_files_that_cannot_be(tmp_path: Path, text: str, message: str) -> None:

@@ -74,14 +74,8 @@ def test_import_and_eval_of_boxes_name_whole_yaws(tmp_path: Path) -> None:
     for line in lines:
         for number, box in enumerate(line["boxes"]):
             box |= {"yaw_rad": number + 4, "score": 0.5}
-    text = "".join(json.dumps(line) + "\n" for line in lines)
-    boxes.write_text(text)
-    importing = ("import", boxes, tmp_path / "out", "--scans", own / "scans")
-    scoring = ("eval", "--data", own, "--split", "training", "--predictions", boxes, "-o", tmp_path / "evaluation")
-    assert "all 6 yaws that are not 0 are whole numbers, such as 5: radians are wanted" in invoke(*importing)
-    output = invoke(*scoring)
+    boxes.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    output = invoke("import", boxes, tmp_path / "out", "--scans", own / "scans")
+    assert "all 6 yaws that are not 0 are whole numbers, such as 5: radians are wanted" in output
+    output = invoke("eval", "--data", own, "--split", "training", "--predictions", boxes, "-o", tmp_path / "scores")
     assert "predictions: all 6 yaws" in output and "labels: all" not in output
-    boxes.write_text(text.replace('"yaw_rad": 4', '"yaw_rad": 90'))
-    for command in (importing, scoring):
-        with pytest.raises(DatasetError, match=r"boxes\.jsonl:1, box 1: yaw_rad is 90, .*radians"):
-            invoke(*command)

@@ -93,7 +93,6 @@ def with_box(**changes: object) -> str:
     [
         ("l.jsonl", '{"scan": "a", "boxes": []}\n{"scan"', r"l\.jsonl:2: not valid JSON"),
         ("l.jsonl", '{"boxes": []}', r'l\.jsonl:1: no "scan"'),
-        ("l.jsonl", "[1]", r'l\.jsonl:1: no "scan"'),
         ("l.jsonl", '{"scan": "a"}', r'l\.jsonl:1: no list "boxes"'),
         ("l.jsonl", '{"scan": "a", "boxes": [7]}', r"l\.jsonl:1, box 1: 7 is no record"),
         ("l.jsonl", json.dumps({"scan": "a", "boxes": [BOX, BOX | {"x_m": "far"}]}), r"1, box 2: x_m is 'far'"),
@@ -102,12 +101,10 @@ def with_box(**changes: object) -> str:
         ("l.jsonl", with_box(x_m=10**400), r"box 1: x_m is '1000"),
         ("l.jsonl", with_box(score=-(10**400)), r"box 1: score is '-1000"),
         ("l.jsonl", with_box(yaw_rad=235), r"yaw_rad is 235, .* radians .* pi / 180"),
-        ("l.jsonl", with_box(yaw_rad=-6.5), r"yaw_rad is -6\.5, .*radians"),
         ("l.jsonl", with_box(width_m=0), r"box 1: width_m is 0"),
         ("l.jsonl", with_box(**{"class": " "}), r"box 1: no `class`"),
         ("l.jsonl", '{"scan": "a", "boxes": [{"class": "Car", "x": 1}]}', r"box 1: no `y_m`"),
         ("l.jsonl", '{"scan": "a", "objects": [{"centroid": {}}]}', r"labels of labelCloud; .*--from labelcloud"),
-        ("l.csv", "scan,class,x\na,Car,1\n", r"l\.csv:2: no `y_m`"),
         ("l.csv", "class,x\nCar,1\n", r"l\.csv:2: no `scan`"),
         ("l.csv", "scan,class\na,Car,1\n", r"l\.csv:2: 3 values for 2 columns"),
         ("l.csv", "scan,class,class\na,Car,1\n", r"l\.csv:1: the column `class` is there twice"),
@@ -116,7 +113,7 @@ def with_box(**changes: object) -> str:
         ("l.csv", "scan,class,x,x_m\na,Car,1,9\n", r"l\.csv:2: both `x` and `x_m`; remove one"),
         ("l.txt", "", r"l\.txt: labels of several frames are \.jsonl or \.csv"),
     ],
-    ids=range(24),
+    ids=range(21),
 )
 def test_a_mistake_is_named(tmp_path: Path, name: str, text: str, message: str) -> None:
     with pytest.raises(DatasetError, match=message):

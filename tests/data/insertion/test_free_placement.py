@@ -6,16 +6,15 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from shapely.geometry import Polygon
 
 from asca_pillars.data.frames import LabeledFrame
 from asca_pillars.data.insertion.free_placement import MARGIN_M, Scene, is_clear, move_to_free_position, rays_entering
 from asca_pillars.data.insertion.free_space import find_free_space
 from asca_pillars.data.insertion.gt_database import StoredObject
 from asca_pillars.detection.anchors import IGNORED
-from asca_pillars.geometry.boxes import footprints, points_in_boxes, wrap_angle
+from asca_pillars.geometry.boxes import points_in_boxes, wrap_angle
 from asca_pillars.ops.pillar.grid import PillarGrid
-from tests.data.insertion.simple_streets import LEVEL, cast, stand, street
+from tests.data.insertion.simple_streets import LEVEL, cast, polygons, stand, street
 
 GRID = PillarGrid(x_range_m=(0, 40.96), y_range_m=(-20.48, 20.48), v_max_m=0.32, zones=1).ranges
 NO_BOXES = np.zeros((0, 7), np.float32)
@@ -123,10 +122,6 @@ def local(item: StoredObject) -> np.ndarray:
     away = item.points[:, :3].astype(float) - item.box[:3]
     cos, sin = np.cos(item.box[6]), np.sin(item.box[6])
     return away @ np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]])
-
-
-def polygons(boxes: np.ndarray) -> list[Polygon]:
-    return [Polygon(outline) for outline in footprints(boxes.astype(float))]
 
 
 def test_places_are_found_where_there_are_some() -> None:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from shapely.geometry import MultiPoint, Point, Polygon
+from shapely.geometry import MultiPoint, Point
 
 from asca_pillars.base.errors import DatasetError
 from asca_pillars.data.insertion import free_space as free_maps
@@ -20,9 +20,9 @@ from asca_pillars.data.insertion.free_space import (
 )
 from asca_pillars.data.insertion.ground_fit import cluster_boxes, fit_ground
 from asca_pillars.data.kitti import KittiSplit, in_image
-from asca_pillars.geometry.boxes import footprints, points_in_boxes
+from asca_pillars.geometry.boxes import points_in_boxes
 from asca_pillars.scans.scan_reader import read_scan, write_scan
-from tests.data.insertion.simple_streets import AZIMUTHS_RAD, LEVEL, cast, stand, street, write_streets
+from tests.data.insertion.simple_streets import AZIMUTHS_RAD, LEVEL, cast, polygons, stand, street, write_streets
 
 BOXES = np.array(
     [stand("Car", 10, 3, 0.3), stand("Car", 15, -4, 1.2), stand("Pedestrian", 9, -1), stand("Cyclist", 20, 1, 2.0)]
@@ -33,36 +33,36 @@ def middles(space: FreeSpace) -> np.ndarray:
     return space.cells[0].T
 
 
+def along_rays(ground: np.ndarray, start: float, end: float) -> np.ndarray:
+    """(100 n, 3) along the sight lines to points (n, 2) of the ground."""
+    return (np.linspace(start, end, 100)[:, None, None] * np.insert(ground, 2, LEVEL[2], axis=1)).reshape(-1, 3)
+
+
 def test_ground_is_free_where_it_is_seen_and_nothing_stands() -> None:
-    points = cast(LEVEL, BOXES)
-    space = find_free_space(points)
+    space = find_free_space(cast(LEVEL, BOXES))
     free = middles(space)
     # The lowest returns of a side may pass for ground: its own cell, no more, may be free.
-    outlines = [Polygon(outline).buffer(-CELL_M) for outline in footprints(BOXES.astype(float))]
+    outlines = [outline.buffer(-CELL_M) for outline in polygons(BOXES)]
     assert not any(outline.contains(Point(xy)) for xy in free for outline in outlines)
 
     # A sight line to the ground between a box and the end of its shadow passes through the box.
-    ground = np.column_stack([free, np.full(len(free), LEVEL[2])])
-    along = np.linspace(0.02, 0.98, 100)[:, None, None] * ground[None]
-    hidden = points_in_boxes(along.reshape(-1, 3), BOXES, margin_m=-0.15).any(axis=1).reshape(100, -1).any(axis=0)
-    assert hidden.mean() < 0.01
+    inside = points_in_boxes(along_rays(free, 0.02, 0.98), BOXES, margin_m=-0.15).any(axis=1)
+    assert inside.reshape(100, -1).any(axis=0).mean() < 0.01
 
     # Nearly everything else within 20 m, cell by cell, is free, although the rings there are metres apart.
-    every = np.stack(np.meshgrid(np.arange(6, 20, CELL_M), np.arange(-6, 6, CELL_M), indexing="ij"), axis=-1).reshape(
-        -1, 2
-    )
-    seen = np.abs(np.arctan2(every[:, 1], every[:, 0])) < AZIMUTHS_RAD.max() - 0.02
-    along = np.linspace(0.02, 1, 100)[:, None, None] * np.column_stack([every, np.full(len(every), LEVEL[2])])[None]
-    clear = ~points_in_boxes(along.reshape(-1, 3), BOXES, margin_m=0.4).any(axis=1).reshape(100, -1).any(axis=0)
-    assert (seen & clear).sum() > 1000
-    assert space.is_free(every[seen & clear]).mean() > 0.97
+    grid = np.meshgrid(np.arange(6, 20, CELL_M), np.arange(-6, 6, CELL_M), indexing="ij")
+    every = np.stack(grid, axis=-1).reshape(-1, 2)
+    every = every[np.abs(np.arctan2(every[:, 1], every[:, 0])) < AZIMUTHS_RAD.max() - 0.02]
+    inside = points_in_boxes(along_rays(every, 0.02, 1), BOXES, margin_m=0.4).any(axis=1)
+    clear = every[~inside.reshape(100, -1).any(axis=0)]
+    assert len(clear) > 1000 and space.is_free(clear).mean() > 0.97
 
 
 def test_what_is_beside_the_view_is_not_free() -> None:
-    free = middles(find_free_space(cast(LEVEL, BOXES)))
+    space = find_free_space(cast(LEVEL, BOXES))
+    free = middles(space)
     assert len(free) > 5000
     assert np.abs(np.arctan2(free[:, 1], free[:, 0])).max() < AZIMUTHS_RAD.max() + 0.05
-    space = find_free_space(cast(LEVEL, BOXES))
     assert not space.is_free(np.array([[-5.0, 0.0], [1e6, 0.0], [10.0, 30.0]])).any()
 
 
@@ -73,11 +73,9 @@ def test_steep_ground_is_not_free(slope: float, some: bool) -> None:
 
 
 def test_every_object_is_in_a_cluster_of_its_own() -> None:
-    space = find_free_space(cast(LEVEL, BOXES))
-    outlines = [Polygon(outline) for outline in footprints(BOXES.astype(float))]
-    clusters = [Polygon(outline) for outline in footprints(space.clusters.astype(float))]
+    clusters = polygons(find_free_space(cast(LEVEL, BOXES)).clusters)
     assert len(clusters) == len(BOXES)
-    for outline in outlines:
+    for outline in polygons(BOXES):
         assert sum(outline.intersects(cluster) for cluster in clusters) == 1
 
 

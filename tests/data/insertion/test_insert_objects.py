@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from shapely.geometry import Polygon
 from torch.utils.data import DataLoader
 
 from asca_pillars.base.errors import ConfigError, DatasetError
@@ -29,12 +28,12 @@ from asca_pillars.data.kitti import (
     write_image_set,
     write_labels,
 )
-from asca_pillars.geometry.boxes import footprints, points_in_boxes
+from asca_pillars.geometry.boxes import points_in_boxes
 from asca_pillars.scans.scan_reader import write_scan
 from asca_pillars.training.dataset import Collate, open_dataset
 from asca_pillars.training.shared_batches import loader_context
 from tests.data.insertion.inserters import METHODS, config, open_inserter
-from tests.data.insertion.simple_streets import TYPES, write_streets
+from tests.data.insertion.simple_streets import TYPES, polygons, write_streets
 from tests.helpers.scenes import SPEC
 
 FRAMES = 6
@@ -64,10 +63,6 @@ def augmented(inserter: Inserter, root: Path, number: int, seed: int = 0) -> tup
 
 def assert_same(one: LabeledFrame, other: LabeledFrame) -> None:
     assert np.array_equal(one.points, other.points) and np.array_equal(one.boxes, other.boxes)
-
-
-def polygons(boxes: np.ndarray) -> list[Polygon]:
-    return [Polygon(outline) for outline in footprints(boxes.astype(float))]
 
 
 @settings(max_examples=200, deadline=None)

@@ -5,6 +5,7 @@ import gc
 import gzip
 import shutil
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -43,43 +44,56 @@ from tests.scans.recordings.decompression_bombs import zstd_zeros
 DATA = np.random.default_rng(0).integers(0, 9, 300_000, np.uint8).tobytes()
 
 
-def test_what_was_packed_comes_back() -> None:
+def unsized(data: bytes) -> bytes:
+    """A frame of zstd that does not state its size."""
     packer = zstandard.ZstdCompressor().compressobj()
-    unsized = packer.compress(DATA) + packer.flush()
-    for packed in (zstandard.compress(DATA), unsized):
-        assert decompress_zstd(packed) == decompress_zstd(packed, len(DATA)) == DATA
-    assert decompress_lz4(lz4.frame.compress(DATA)) == decompress_lz4(lz4.frame.compress(DATA), len(DATA)) == DATA
-    assert decompress_bz2(bz2.compress(DATA)) == DATA
+    return packer.compress(data) + packer.flush()
+
+
+ZSTD, UNSIZED, LZ4, BZ2 = zstandard.compress(DATA), unsized(DATA), lz4.frame.compress(DATA), bz2.compress(DATA)
+
+
+def test_what_was_packed_comes_back() -> None:
+    for unpack, packed in ((decompress_zstd, ZSTD), (decompress_zstd, UNSIZED), (decompress_lz4, LZ4)):
+        assert unpack(packed) == unpack(packed, len(DATA)) == DATA
+    assert decompress_bz2(BZ2) == DATA
 
 
 @pytest.mark.parametrize("size", [len(DATA) - 1, len(DATA) + 1, 0, 2**40])
-def test_another_size_than_the_stated_one_is_an_error(size: int) -> None:
-    packer = zstandard.ZstdCompressor().compressobj()
-    for packed in (zstandard.compress(DATA), packer.compress(DATA) + packer.flush()):
-        with pytest.raises((ValueError, zstandard.ZstdError)):
-            decompress_zstd(packed, size)
-    with pytest.raises(ValueError):
-        decompress_lz4(lz4.frame.compress(DATA), size)
+@pytest.mark.parametrize(
+    ("unpack", "packed"),
+    [(decompress_zstd, ZSTD), (decompress_zstd, UNSIZED), (decompress_lz4, LZ4)],
+    ids=["zstd", "unsized zstd", "lz4"],
+)
+def test_another_size_than_the_stated_one_is_an_error(
+    unpack: Callable[[bytes, int], bytes], packed: bytes, size: int
+) -> None:
+    with pytest.raises((ValueError, zstandard.ZstdError)):
+        unpack(packed, size)
 
 
-def test_decompression_bombs_are_stopped_at_the_limit(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("unpack", "bomb"),
+    [
+        (decompress_zstd, zstd_zeros(2**33, stated=True)),
+        (decompress_zstd, zstd_zeros(2**33, stated=False)),
+        (decompress_lz4, lz4.frame.compress(bytes(2**24))),
+        (decompress_bz2, bz2.compress(bytes(2**24))),
+    ],
+    ids=["zstd", "unsized zstd", "lz4", "bz2"],
+)
+def test_decompression_bombs_are_stopped_at_the_limit(
+    unpack: Callable[[bytes], bytes], bomb: bytes, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(decompression, "MAX_BYTES", 2**20)
-    zeros = bytes(2**24)
-    for bomb in (zstd_zeros(2**33, stated=True), zstd_zeros(2**33, stated=False)):
-        with pytest.raises(ValueError, match=r"\d+ bytes (state that they )?unpack to"):
-            decompress_zstd(bomb)
-    with pytest.raises(ValueError, match="unpack to more than"):
-        decompress_lz4(lz4.frame.compress(zeros))
-    with pytest.raises(ValueError, match="unpack to more than"):
-        decompress_bz2(bz2.compress(zeros))
+    with pytest.raises(ValueError, match=r"\d+ bytes (state that they )?unpack to"):
+        unpack(bomb)
 
 
 def test_torn_streams_are_errors() -> None:
-    for unpack, packed in ((decompress_lz4, lz4.frame.compress(DATA)), (decompress_bz2, bz2.compress(DATA))):
-        with pytest.raises(ValueError, match="end is missing"):
+    for unpack, packed in ((decompress_lz4, LZ4), (decompress_bz2, BZ2), (decompress_zstd, ZSTD)):
+        with pytest.raises((ValueError, zstandard.ZstdError), match=r"end is missing|decompress"):
             unpack(packed[:-8])
-    with pytest.raises(zstandard.ZstdError):
-        decompress_zstd(zstandard.compress(DATA)[:-8])
 
 
 # --- rosbag2
@@ -151,15 +165,13 @@ def test_files_with_damage(tmp_path: Path, suffix: str) -> None:
     """What lies before it is read; what is not packed at all is refused."""
     noise = np.random.default_rng(0)
     messages = [(time_ns, laid_out(noise.random((5000, 4), np.float32), time_ns=time_ns)) for time_ns in stamps(40)]
-    data = write_mcap(tmp_path / "a.mcap", {"/lidar": messages}, use_chunking=False).read_bytes()
-    packed = PACK[suffix](data)
-    path = tmp_path / f"b.mcap{suffix}"
-    for damaged in (packed[: len(packed) // 2], packed[: len(packed) // 2] + bytes(len(packed) // 2)):
+    packed = PACK[suffix](write_mcap(tmp_path / "a.mcap", {"/lidar": messages}, use_chunking=False).read_bytes())
+    path, half = tmp_path / f"b.mcap{suffix}", len(packed) // 2
+    for damaged in (packed[:half], packed[:half] + bytes(half)):
         path.write_bytes(damaged)
         recording = open_recording(path)
         # bzip2's blocks have 0.9 MB, a frame of LZ4 at most 4.
-        count = sum(1 for _ in recording.messages("/lidar"))
-        assert 5 <= count < 40
+        assert 5 <= sum(1 for _ in recording.messages("/lidar")) < 40
         assert str(recording.damage).startswith(f"{path}: ends early")
     path.write_bytes(b"not packed")
     with pytest.raises(ScanError, match=rf"b\.mcap{suffix}: no readable {suffix} file .*; copy or record it again$"):
@@ -212,8 +224,7 @@ def test_files_that_unpack_to_gigabytes_are_refused(
 
 
 def test_a_full_disk_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    plain = write_mcap(tmp_path / "a.mcap", {"/lidar": clouds(3)})
-    (tmp_path / "a.mcap.zst").write_bytes(zstandard.compress(plain.read_bytes()))
+    (tmp_path / "a.mcap.zst").write_bytes(ZSTD)
     monkeypatch.setattr(shutil, "disk_usage", lambda _: type("Usage", (), {"free": 10}))
     with pytest.raises(ScanError, match=r"a\.mcap\.zst: unpacks to \d+ bytes, and .* has room for 10; set TMPDIR"):
         open_recording(tmp_path / "a.mcap.zst")
