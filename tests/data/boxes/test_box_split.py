@@ -120,8 +120,8 @@ def test_prepare_makes_the_maps_that_training_reads(
     """Without a camera nothing is cut to its view, whatever `data.camera_view` is by default."""
     (tmp_path / "own.yaml").write_text(yaml.safe_dump(to_dict(CONFIG)))
     prepare(tmp_path / "own.yaml", data=root, workers=1)
-    monkeypatch.setattr("asca_pillars.data.insertion.free_space.find_free_space", lambda _: pytest.fail("again"))
-    monkeypatch.setattr("asca_pillars.data.insertion.gt_database._build", lambda *_: pytest.fail("built again"))
+    for name in ("free_space.find_free_space", "gt_database._build"):
+        monkeypatch.setattr(f"asca_pillars.data.insertion.{name}", lambda *_: pytest.fail("again"))
     insert = replace(CONFIG.augment, insert=InsertConfig("rs_aug", objects=4))
     inserter = open_frames(root, replace(CONFIG, augment=insert), training=True).inserter
     assert inserter is not None and all(inserter.free_space(name).free.any() for name in inserter.split.frame_ids)

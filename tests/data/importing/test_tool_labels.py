@@ -119,16 +119,18 @@ def test_degrees_cannot_pass_for_radians(tmp_path: Path, tool: str) -> None:
 def test_radians_cannot_pass_for_degrees(tmp_path: Path) -> None:
     source = write_files(tmp_path, "labelcloud", {"0": records_from(BOX, ["Car"])})
     path, classes = source / "0.json", source / "_classes.json"
-    content = json.loads(path.read_text())
+    content, text = json.loads(path.read_text()), classes.read_text()
     content["objects"][0]["rotations"]["z"] = -1.25
     path.write_text(json.dumps(content))
-    with pytest.raises(DatasetError, match=r"rotation of -1\.25, and centroid_abs has 0 to 360 .*centroid_rel"):
-        read(source, "labelcloud")
-    classes.write_text(classes.read_text().replace("centroid_abs", "centroid_rel"))
+    for form, message in (
+        ("centroid_abs", r"rotation of -1\.25, and centroid_abs has 0 to 360 .*centroid_rel"),
+        ("vertices", r"_classes\.json: the format vertices; set centroid_abs"),
+    ):
+        classes.write_text(text.replace("centroid_abs", form))
+        with pytest.raises(DatasetError, match=message):
+            read(source, "labelcloud")
+    classes.write_text(text.replace("centroid_abs", "centroid_rel"))
     assert read(source, "labelcloud").frames[0].records.boxes[0, 6] == pytest.approx(-1.25)
-    classes.write_text(classes.read_text().replace("centroid_rel", "vertices"))
-    with pytest.raises(DatasetError, match=r"_classes\.json: the format vertices; set centroid_abs"):
-        read(source, "labelcloud")
 
 
 @pytest.mark.parametrize(

@@ -232,13 +232,12 @@ def test_a_frame_without_ground_or_points_stays_as_it_is(tmp_path: Path) -> None
 def test_a_class_without_objects_is_named(tmp_path: Path) -> None:
     split = KittiSplit(write_streets(tmp_path, 2), "train")
     for frame_id in split.frame_ids:
-        text = split.label_path(frame_id).read_text()
-        split.label_path(frame_id).write_text(text.replace("Cyclist", "Misc"))
+        path = split.label_path(frame_id)
+        path.write_text(path.read_text().replace("Cyclist", "Misc"))
     with pytest.raises(DatasetError, match=r"list `train` has no Cyclist with a point in it; .* --propose") as caught:
         open_dataset(tmp_path, config("rs_aug"), training=True)
     assert "\n" not in str(caught.value) and str(tmp_path) in str(caught.value)
-    without = inserter_of(tmp_path, "rs_aug", proportions={"Car": 1, "Pedestrian": 1})
-    assert without.shares[2] == 0
+    assert inserter_of(tmp_path, "rs_aug", proportions={"Car": 1, "Pedestrian": 1}).shares[2] == 0
     with pytest.raises(DatasetError, match="has no Car with 1000000 or more points"):
         inserter_of(tmp_path, "gt_aug", min_points=1_000_000, proportions={"Car": 1})
 
@@ -290,9 +289,8 @@ def write_boxes(street: Path, root: Path, sensor_m: tuple[float, float, float]) 
     for frame_id in split.frame_ids:
         frame = read_frame(split, frame_id, TYPES, camera_view=False)
         points, boxes = frame.points, np.array(frame.boxes, np.float64)
-        points[:, :3] = np.round(points[:, :3] * 512) / 512  # so that nothing is rounded when they are moved
+        points[:, :3] = np.round(points[:, :3] * 512) / 512 + sensor_m  # rounded, so that moving them rounds nothing
         boxes[:, :6] = np.round(boxes[:, :6] * 512) / 512
-        points[:, :3] += np.array(sensor_m, np.float32)
         boxes[:, :3] += sensor_m
         write_scan(root / "scans" / f"{frame_id}.bin", points)
         lines.append(json_line(f"{frame_id}.bin", records_from(boxes, [TYPES[label] for label in frame.labels])))
@@ -303,9 +301,8 @@ def write_boxes(street: Path, root: Path, sensor_m: tuple[float, float, float]) 
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_what_hides_what_is_seen_from_the_sensor(tmp_path: Path, method: str) -> None:
+def test_what_hides_what_is_seen_from_the_sensor(root: Path, tmp_path: Path, method: str) -> None:
     """In a vehicle's frame, as Argoverse 2's and Waymo's are, the origin is on the ground."""
-    root = write_streets(tmp_path / "streets", 6)
     sensor_m, grown = (1.5, 0.25, 1.75), []
     for name, position in (("sensor", (0.0, 0.0, 0.0)), ("vehicle", sensor_m)):
         split = BoxSplit(write_boxes(root, tmp_path / name, position), "train")
@@ -315,7 +312,7 @@ def test_what_hides_what_is_seen_from_the_sensor(tmp_path: Path, method: str) ->
         grown.append([insert_objects(frame, inserter, np.random.default_rng(0)) for frame in frames])
         assert sum(len(after.boxes) - len(before.boxes) for after, before in zip(grown[-1], frames, strict=True)) > 6
     for own, other in zip(*grown, strict=True):
-        assert len(own.points) == len(other.points)
-        np.testing.assert_allclose(other.points[:, :3] - np.array(sensor_m, np.float32), own.points[:, :3], atol=1e-4)
-        np.testing.assert_allclose(other.boxes[:, :3] - np.array(sensor_m, np.float32), own.boxes[:, :3], atol=1e-4)
         np.testing.assert_array_equal(other.labels, own.labels)
+        for moved, still in ((other.points, own.points), (other.boxes, own.boxes)):
+            assert len(moved) == len(still)
+            np.testing.assert_allclose(moved[:, :3] - np.array(sensor_m, np.float32), still[:, :3], atol=1e-4)

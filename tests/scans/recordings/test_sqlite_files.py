@@ -1,7 +1,7 @@
 """SQLite files of rosbag2 with rows that cannot be used."""
 
 import sqlite3
-from contextlib import closing
+from contextlib import closing, suppress
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -119,17 +119,14 @@ def test_damaged_pages_cost_the_scans_on_them(tmp_path: Path) -> None:
     whole = database(tmp_path / "a.db3", points=2000).read_bytes()  # each on pages of its own
     counts = set()
     for start in range(4096, len(whole), 4096):
-        damaged = bytearray(whole)
-        damaged[start : start + 4096] = b"\xff" * 4096
+        damaged = whole[:start] + b"\xff" * 4096 + whole[start + 4096 :]
         (tmp_path / "b.db3").write_bytes(damaged)
-        try:
+        with suppress(ScanError):
             recording = open_recording(tmp_path / "b.db3")
             found = list(RecordedScans(recording, recording.point_cloud_topic(), 1.0).read())
-        except ScanError:
-            continue
-        assert [one.time_ns for one in found] == stamps(5)[: len(found)]
-        assert recording.damage is not None or len(found) == 5
-        counts.add(sum(one.scan is not None for one in found))
+            assert [one.time_ns for one in found] == stamps(5)[: len(found)]
+            assert recording.damage is not None or len(found) == 5
+            counts.add(sum(one.scan is not None for one in found))
     assert max(counts) <= 5 and 4 in counts
 
 
@@ -151,10 +148,8 @@ def test_damaged_rows_do_not_lead_back_to_earlier_ones(tmp_path: Path, bits: lis
 
 
 def test_poses_without_a_time_are_left_out(tmp_path: Path) -> None:
-    message = odometry_message(0, 1.0)
-    data = serialized(message, ODOMETRY)
-    rows: list[tuple[str, tuple[Any, ...]]]
-    rows = [("INSERT INTO topics VALUES (2, '/odom', 'nav_msgs/msg/Odometry', 'cdr')", ())]
-    rows += [("INSERT INTO messages(topic_id, timestamp, data) VALUES (2, ?, ?)", (t, data)) for t in (None, 1e300, 5)]
-    poses = read_poses(open_recording(database(tmp_path / "a.db3", *rows)), "/odom")
-    assert poses.times_ns.tolist() == [5]
+    data = serialized(odometry_message(0, 1.0), ODOMETRY)
+    add = "INSERT INTO messages(topic_id, timestamp, data) VALUES (2, ?, ?)"
+    topic: tuple[str, tuple[Any, ...]] = ("INSERT INTO topics VALUES (2, '/odom', 'nav_msgs/msg/Odometry', 'cdr')", ())
+    path = database(tmp_path / "a.db3", topic, *((add, (time_ns, data)) for time_ns in (None, 1e300, 5)))
+    assert read_poses(open_recording(path), "/odom").times_ns.tolist() == [5]
