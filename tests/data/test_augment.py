@@ -29,10 +29,9 @@ from asca_pillars.geometry.overlap import bev_intersection
 from tests.helpers.scenes import make_scene
 
 STILL = AugmentConfig(
-    **dict.fromkeys(("flip_probability", "rotation_rad", "shift_z_m", "point_dropout"), 0.0),
-    **dict.fromkeys(("object_rotation_rad", "object_shift_m"), 0.0),
-    scale=(1, 1),
-)
+    flip_probability=0, rotation_rad=0, scale=(1, 1), shift_z_m=0, object_rotation_rad=0, object_shift_m=0,
+    point_dropout=0,
+)  # fmt: skip
 STRONG = AugmentConfig(
     rotation_rad=math.pi, scale=(0.8, 1.25), shift_z_m=0.5, object_rotation_rad=1.0, object_shift_m=0.5
 )

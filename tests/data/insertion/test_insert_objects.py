@@ -194,7 +194,7 @@ def test_samples_depend_on_seed_epoch_and_frame_alone(root: Path, method: str) -
 def test_any_number_of_workers_gives_the_same(root: Path) -> None:
     frames = open_dataset(root, config("rs_aug"), training=True)
     batches = [[(0, number), (1, number)] for number in range(FRAMES)]
-    options = {"collate_fn": Collate(frames.preparation), "multiprocessing_context": loader_context()}
+    options: dict[str, Any] = {"collate_fn": Collate(frames.preparation), "multiprocessing_context": loader_context()}
     loader = DataLoader(frames, batch_sampler=batches, num_workers=2, **options)
     for batch, indices in zip(loader, batches, strict=True):
         for boxes, labels, index in zip(batch.boxes, batch.labels, indices, strict=True):

@@ -1,6 +1,7 @@
 """Recordings of every kind: topics, order, damage."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -145,7 +146,7 @@ def test_messages_that_cannot_be_read_are_not_tried_without_end(
     assert "message 11: 5 before it cannot be read" in str(recording.damage)
 
 
-def scans_of(path: Path, points: list[np.ndarray], **options: int) -> RecordedScans:
+def scans_of(path: Path, points: list[np.ndarray], **options: Any) -> RecordedScans:
     """Of a recording with these clouds, one reflectance scale for all of them."""
     messages = [(time, laid_out(one, time_ns=time)) for time, one in zip(stamps(len(points)), points, strict=True)]
     recording = open_recording(write_mcap(path, {"/lidar": messages}, **options))
