@@ -80,17 +80,6 @@ def test_points_on_borders_fall_into_the_same_pillars(grid: PillarGrid) -> None:
     assert_same_bits(pillars, by_numpy(pillarize, points, grid, LIMITS[0]))
 
 
-def test_real_sizes_are_the_same() -> None:
-    # More pillars than the limit, and crowds: a cloud dense at the sensor and thin far from it.
-    rng = np.random.default_rng(7)
-    distance, angle = 70 * rng.random(60_000) ** 2, rng.uniform(-1.4, 1.4, 60_000)
-    columns = (distance * np.cos(angle), distance * np.sin(angle), rng.normal(-1, 0.7, 60_000), rng.random(60_000))
-    points = np.column_stack(columns).astype(np.float32)
-    pillars = pillarize(points, PillarGrid(), PillarLimits(10_000, 32))
-    assert pillars.stats.pillars_over_limit > 0 and pillars.point_counts.max() == 32
-    assert_same_bits(pillars, by_numpy(pillarize, points, PillarGrid(), PillarLimits(10_000, 32)))
-
-
 def test_memory_that_numba_does_not_know_is_copied() -> None:
     points = cloud(3, 400, 0.5, GRIDS[2], 0.0)
     expected = pillarize(points, GRIDS[2], LIMITS[1])

@@ -52,7 +52,7 @@ def test_folders_that_are_linked_crosswise_are_visited_once(tmp_path: Path) -> N
 
 
 def test_folders_deeper_than_python_calls_itself(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    depth = 1200
+    depth = 1010
     monkeypatch.chdir(tmp_path)
     for _ in range(depth):
         Path("d").mkdir()

@@ -24,10 +24,16 @@ from asca_pillars.data.training_frames import open_frames
 from asca_pillars.detection.anchors import ClassSpec
 from asca_pillars.scans.mounting import Mounting
 from asca_pillars.scans.scan_reader import read_scan, write_scan
+from tests.data.boxes.box_scenes import write_box_dataset
 from tests.helpers.scenes import SPEC, make_scene, write_dataset
 
 CLASSES = (SPEC.classes[0], ClassSpec("Forklift", 0.8, 0.6, 1.73, -0.87, 0.35, 0.2))
 CONFIG = Config(model=PillarModel(spec=replace(SPEC, classes=CLASSES)), data=DataConfig(workers=0))
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    return write_box_dataset(tmp_path / "own", 4)
 
 
 def test_the_layout_tells_the_reader(root: Path, tmp_path: Path) -> None:

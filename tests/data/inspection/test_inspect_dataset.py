@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import math
 import re
 import subprocess
 import sys
@@ -23,6 +22,7 @@ from asca_pillars.data.inspection.measurements import MatchOutcome, match, measu
 from asca_pillars.data.kitti import KittiSplit, read_labels
 from asca_pillars.detection.anchors import IGNORED
 from asca_pillars.detection.targets import Assigner, assign_targets
+from asca_pillars.geometry.boxes import points_in_boxes
 from asca_pillars.geometry.overlap import aligned_bev_iou
 from asca_pillars.ops.pillar.prepare import PillarLimits
 from asca_pillars.scans.scan_reader import read_scan
@@ -61,15 +61,11 @@ def test_counts_sizes_and_points_of_a_class_by_plain_loops(clean: Path) -> None:
     assert inspection.frames_without_objects == 0 and not inspection.sampled
 
 
-def test_points_of_a_box_by_a_plain_loop(clean: Path) -> None:
+def test_points_of_a_box_are_those_in_it(clean: Path) -> None:
     split = KittiSplit(clean)
     measure = measure_frame(split, "000000", pillar_spec(CONFIG), CONFIG.data)
-    counts = [0] * len(measure.boxes)
-    for x, y, z, _ in read_scan(split.scan_path("000000")).points.tolist():  # the camera sees all of the boxes
-        for row, (bx, by, bz, length, width, height, yaw) in enumerate(measure.boxes.tolist()):
-            along = math.cos(yaw) * (x - bx) + math.sin(yaw) * (y - by)
-            across = math.cos(yaw) * (y - by) - math.sin(yaw) * (x - bx)
-            counts[row] += abs(along) <= length / 2 and abs(across) <= width / 2 and abs(z - bz) <= height / 2
+    points = read_scan(split.scan_path("000000")).points  # the camera sees all of the boxes
+    counts = points_in_boxes(points, measure.boxes).sum(axis=0).tolist()
     assert measure.points.tolist() == counts and min(counts) > 20
     assert measure.labels.tolist() == [0, 0, 1, 2]
 

@@ -100,8 +100,7 @@ def test_messages_that_a_rosbag2_counts_and_that_are_gone_are_damage(tmp_path: P
     import apsw
 
     write_recording(tmp_path / "bag", iter([(time_ns, cloud_points(0)) for time_ns in stamps(3)]))
-    (database,) = (tmp_path / "bag").glob("*.db3")
-    with apsw.Connection(str(database)) as connection:
+    with apsw.Connection(str(tmp_path / "bag" / "bag.db3")) as connection:
         connection.execute(f"DELETE FROM messages WHERE timestamp = {stamps(3)[1]}")
     recording = open_recording(tmp_path / "bag")
     assert len(list(recording.messages(TOPIC))) == 2
