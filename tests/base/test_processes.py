@@ -31,11 +31,9 @@ def squares(count: int, workers: int, at_once: int = 4) -> Iterator[tuple[int, i
 def test_results_come_in_order_from_processes_of_one_thread(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("OPENBLAS_NUM_THREADS", "3")
     monkeypatch.delenv("OPENCV_FOR_THREADS_NUM", raising=False)
-    found = list(squares(50, 2))
-    assert [result for result, _, _ in found] == [number * number for number in range(50)]
-    processes = {process for _, process, _ in found}
-    assert len(processes) in (1, 2) and os.getpid() not in processes  # one may be quicker than the other's start
-    assert {threads for _, _, threads in found} == {1}
+    results, processes, threads = zip(*squares(50, 2), strict=True)
+    assert results == tuple(number * number for number in range(50)) and set(threads) == {1}
+    assert len(set(processes)) in (1, 2) and os.getpid() not in processes  # one may be quicker than the other's start
     assert os.environ["OPENBLAS_NUM_THREADS"] == "3" and "OPENCV_FOR_THREADS_NUM" not in os.environ
 
 

@@ -61,6 +61,10 @@ def test_a_pose_lifts_and_turns_and_may_be_an_array() -> None:
     assert mounting == Mounting(sensor_height_m=0.0, pose=pose) and hash(mounting)
 
 
+def rows(*diagonal: float) -> tuple[tuple[float, ...], ...]:
+    return tuple(map(tuple, np.diag(diagonal).tolist()))
+
+
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
@@ -68,16 +72,16 @@ def test_a_pose_lifts_and_turns_and_may_be_an_array() -> None:
         ({"axes": "x,x,z"}, "give x-forward"),
         ({"axes": "--x,y,z"}, "give x-forward"),
         ({"axes": "z,-x,-y"}, "z axis, which must point up or down"),
+        ({"axes": None}, "axes None: give"),
         ({"sensor_height_m": float("nan")}, "sensor height nan"),
         ({"sensor_height_m": 40.0}, "at most 10"),
         ({"sensor_height_m": "auto"}, r"sensor height 'auto': give metres; .measured_mounting"),
-        ({"axes": None}, "axes None: give"),
         ({"pose": "pose.txt"}, r"pose 'pose.txt': give a 4x4 matrix; .read_pose"),
         ({"pose": np.eye(3)}, r"pose of shape \(3, 3\): give a 4x4 matrix"),
         ({"pose": np.eye(4).ravel()}, r"pose of shape \(16,\)"),
-        ({"pose": ((1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 2, 0), (0, 0, 0, 1))}, "a rotation and a shift"),
-        ({"pose": ((1, 0, 0, 0), (0, -1, 0, 0), (0, 0, 1, 0), (0, 0, 0, 1))}, "a rotation and a shift"),
-        ({"pose": tuple(map(tuple, np.eye(4))), "axes": "y-forward"}, "give one of them"),
+        ({"pose": rows(1, 1, 2, 1)}, "a rotation and a shift"),
+        ({"pose": rows(1, -1, 1, 1)}, "a rotation and a shift"),
+        ({"pose": rows(1, 1, 1, 1), "axes": "y-forward"}, "give one of them"),
     ],
 )
 def test_what_cannot_be_is_refused(settings: dict, message: str) -> None:

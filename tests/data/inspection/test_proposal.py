@@ -30,6 +30,10 @@ from tests.models.pv_rcnn.tiny_pv_rcnn import tiny_config
 CONFIG = Config(model=PillarModel(spec=SPEC), data=DataConfig(workers=0))
 
 
+def with_grid(grid: PillarGrid) -> Config:
+    return replace(CONFIG, model=PillarModel(spec=PillarSpec(grid=grid)))
+
+
 @pytest.fixture(scope="module")
 def around(tmp_path_factory: pytest.TempPathFactory) -> BoxSplit:
     return BoxSplit(write_around(tmp_path_factory.mktemp("around"), 60, reach_m=30, z_m=0.3))
@@ -58,36 +62,27 @@ def test_anchors_and_ranges_are_those_of_the_boxes(around: BoxSplit, config: Con
     assert ("learning_rate" in text) == (config is not CONFIG)  # what is the default stays out
 
 
-def test_a_range_that_holds_the_boxes_stays(tmp_path: Path) -> None:
-    split = BoxSplit(write_box_dataset(tmp_path, 12))
-    proposal = propose(split, CONFIG)
-    assert proposal.config.model.spec.grid == SPEC.grid
-    assert [item.name for item in proposal.config.model.spec.classes] == ["Car", "Forklift"]
-
-
 def test_a_range_to_the_sides_that_holds_the_boxes_stays_where_boxes_stand_behind(tmp_path: Path) -> None:
     """A corridor: 20 m ahead and behind, hardly any to the sides."""
-    root = write_around(tmp_path, 40, reach_m=20)
-    lines = []
-    for number, (_, records, *_) in enumerate(read_frames(root / "labels.jsonl")):
+    root, lines = write_around(tmp_path, 40, reach_m=20), []
+    for name, records, *_ in read_frames(root / "labels.jsonl"):
         boxes = records.boxes * [1, 0.2, 1, 1, 1, 1, 1]
-        lines.append(json_line(f"{number}.bin", records_from(boxes, records.types)))
-        points = np.column_stack([np.repeat(boxes[:, :3], 20, axis=0), np.full(40, 0.5)])
-        write_scan(root / "scans" / f"{number}.bin", points)
+        lines.append(json_line(name, records_from(boxes, records.types)))
+        write_scan(root / "scans" / name, np.insert(np.repeat(boxes[:, :3], 20, axis=0), 3, 0.5, axis=1))
     (root / "labels.jsonl").write_text("".join(lines))
     wide = PillarGrid(x_range_m=(4.8, 15.04), y_range_m=(-15.36, 15.36), v_max_m=0.32, zones=2)
-    config = replace(CONFIG, model=PillarModel(spec=PillarSpec(grid=wide)))
-    grid = pillar_spec(propose(BoxSplit(root), config).config).grid
+    grid = pillar_spec(propose(BoxSplit(root), with_grid(wide)).config).grid
     assert grid.x_range_m[0] == -grid.x_range_m[1] and grid.x_range_m[1] > 15
     assert grid.y_range_m == wide.y_range_m
 
 
-def test_a_range_ahead_is_widened_to_legal_ones(tmp_path: Path) -> None:
+def test_a_range_ahead_is_widened_to_legal_ones_and_stays_where_it_holds_the_boxes(tmp_path: Path) -> None:
     narrow = PillarGrid(x_range_m=(4.8, 15.04), y_range_m=(-2.56, 2.56), v_max_m=0.32, zones=2)
-    config = replace(CONFIG, model=PillarModel(spec=PillarSpec(grid=narrow)))
     split = BoxSplit(write_box_dataset(tmp_path, 12))
-    grid = pillar_spec(propose(split, config).config).grid
+    grid = pillar_spec(propose(split, with_grid(narrow)).config).grid
     assert grid.zones == 2 and grid.x_range_m[1] > 20 and grid.y_range_m == (-grid.y_range_m[1], grid.y_range_m[1])
+    spec = propose(split, CONFIG).config.model.spec
+    assert spec.grid == SPEC.grid and spec.class_names == ("Car", "Forklift")
 
 
 def test_pillars_get_room(tmp_path: Path) -> None:
@@ -119,15 +114,11 @@ def test_the_command_writes_what_it_then_inspects(tmp_path: Path) -> None:
 
 
 def test_boxes_with_hardly_a_point_do_not_widen_the_grid(tmp_path: Path) -> None:
-    root = write_box_dataset(tmp_path, 12)
-    far = np.array([[200.0, 0, -1, 2.5, 1.2, 2, 0]])
-    lines = []
-    for number in range(12):
-        path = root / "scans" / f"{number:06d}.bin"
-        points = np.fromfile(path, "<f4").reshape(-1, 4)
-        np.concatenate([points, [[200, 0, -1, 0.5]]]).astype("<f4").tofile(path)
-        near = BoxSplit(root).labeled_boxes(f"{number:06d}").boxes
-        lines.append(json_line(path.name, records_from(np.concatenate([near, far]), ["Car", "Forklift", "Forklift"])))
-    (root / "labels.jsonl").write_text("".join(lines))
-    proposal = propose(BoxSplit(root), CONFIG)
+    split, far, lines = BoxSplit(write_box_dataset(tmp_path, 12)), [200.0, 0, -1, 2.5, 1.2, 2, 0], []
+    for frame_id in split.frame_ids:
+        write_scan(split.scan_path(frame_id), np.append(split.points(frame_id), [[200, 0, -1, 0.5]], axis=0))
+        boxes = np.append(split.labeled_boxes(frame_id).boxes, [far], axis=0)
+        lines.append(json_line(f"{frame_id}.bin", records_from(boxes, ["Car", "Forklift", "Forklift"])))
+    (tmp_path / "labels.jsonl").write_text("".join(lines))
+    proposal = propose(BoxSplit(tmp_path), CONFIG)
     assert proposal.boxes["Forklift"] == 24 and proposal.config.model.spec.grid == SPEC.grid
