@@ -54,6 +54,8 @@ WHEEL = {"radius_m": 0.3}
         ({"engine": {"powr_kw": 3}}, "unknown key `engine.powr_kw`; did you mean `power_kw`?"),
         ({"wheels": [WHEEL, WHEEL | {"spoke": 8}]}, "unknown key `wheels.1.spoke`; did you mean `spokes`?"),
         ({"engine": {"zzz": 3}}, "unknown key `engine.zzz`; known keys: power_kw"),
+        ({"engine": {"[key]": 1}}, "unknown key `engine.[key]`; known keys: power_kw"),
+        ({"spare": {"power": 3}}, "unknown key `spare.power`; did you mean `power_kw`?"),
         ({"wheels[0]": 1}, "unknown key `wheels[0]`; did you mean `wheels`?"),
         ({"wheels": [{"spokes": 3}]}, "missing key `wheels.0.radius_m`"),
         ({"span_m": [1.0]}, "missing key `span_m.1`"),

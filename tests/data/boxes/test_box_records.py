@@ -93,6 +93,7 @@ def with_box(**changes: object) -> str:
     [
         ("l.jsonl", '{"scan": "a", "boxes": []}\n{"scan"', r"l\.jsonl:2: not valid JSON"),
         ("l.jsonl", '{"boxes": []}', r'l\.jsonl:1: no "scan"'),
+        ("l.jsonl", "[1]", r'l\.jsonl:1: no "scan"'),
         ("l.jsonl", '{"scan": "a"}', r'l\.jsonl:1: no list "boxes"'),
         ("l.jsonl", '{"scan": "a", "boxes": [7]}', r"l\.jsonl:1, box 1: 7 is no record"),
         ("l.jsonl", json.dumps({"scan": "a", "boxes": [BOX, BOX | {"x_m": "far"}]}), r"1, box 2: x_m is 'far'"),
@@ -113,7 +114,7 @@ def with_box(**changes: object) -> str:
         ("l.csv", "scan,class,x,x_m\na,Car,1,9\n", r"l\.csv:2: both `x` and `x_m`; remove one"),
         ("l.txt", "", r"l\.txt: labels of several frames are \.jsonl or \.csv"),
     ],
-    ids=range(21),
+    ids=range(22),
 )
 def test_a_mistake_is_named(tmp_path: Path, name: str, text: str, message: str) -> None:
     with pytest.raises(DatasetError, match=message):

@@ -115,32 +115,26 @@ def test_the_end_is_for_validation(tmp_path: Path, scans: list[str], share: floa
     assert set(BoxSplit(out, "train").frame_ids) == set(scans) - val
 
 
-def test_argoverse2(tmp_path: Path) -> None:
-    source = write_argoverse2(tmp_path / "av2")
-    assert "REGULAR_VEHICLE 2" in invoke("import", source, tmp_path / "out", "--from", "argoverse2")
-    split = BoxSplit(tmp_path / "out", "train")
-    assert split.frame_ids == ("val/log_a/sensors/lidar/315966265259836000",)  # the other sweep is not there
-    boxes = split.labeled_boxes(split.frame_ids[0]).boxes
+@pytest.mark.parametrize("linked", [False, True])
+def test_argoverse2(tmp_path: Path, linked: bool) -> None:
+    source, out = write_argoverse2(tmp_path / "av2"), tmp_path / "out"
+    for part in ("log_a/sensors/lidar", "log_b") if linked else ():
+        path = source / "val" / part
+        path.rename(elsewhere := tmp_path / path.name)
+        path.symlink_to(elsewhere)
+    assert "REGULAR_VEHICLE 2" in invoke("import", source, out, "--from", "argoverse2")
+    # One sweep of each log is there, its labels tell of two.
+    sweeps = tuple(f"val/{log}/sensors/lidar/315966265259836000" for log in ("log_a", "log_b"))
+    assert BoxSplit(out).frame_ids == sweeps
+    split = BoxSplit(out, "train")
+    assert split.frame_ids == sweeps[:1]
+    boxes, points = split.labeled_boxes(sweeps[0]).boxes, split.points(sweeps[0])
     assert boxes[0].tolist() == pytest.approx([20, 5, 1, 4, 2, 1.6, 0.7])
     np.testing.assert_allclose(split.to_sensor.points(np.array([[1.35, 0, 1.64]])), 0, atol=1e-6)
-    points = split.points(split.frame_ids[0])
     assert points_in_boxes(points, boxes).all() and points[:, 3].min() >= 0 and 0.5 < points[:, 3].max() <= 1
     # The sweeps are scans for every command, labels and poses beside them are not.
     assert [path.stem for path in find_scans(source)] == ["315966265259836000"] * 2
     assert len(read_scan(find_scans(source)[0]).points) == 50
-
-
-def test_argoverse2_of_links(tmp_path: Path) -> None:
-    source = write_argoverse2(tmp_path / "av2")
-    lidar = source / "val" / "log_a" / "sensors" / "lidar"
-    lidar.rename(tmp_path / "elsewhere")
-    lidar.symlink_to(tmp_path / "elsewhere")
-    (source / "val" / "log_b").rename(tmp_path / "log_b")
-    (source / "val" / "log_b").symlink_to(tmp_path / "log_b")
-    invoke("import", source, tmp_path / "out", "--from", "argoverse2")
-    assert BoxSplit(tmp_path / "out").frame_ids == tuple(
-        f"val/{log}/sensors/lidar/315966265259836000" for log in ("log_a", "log_b")
-    )
 
 
 def test_argoverse2_mistakes_are_named(tmp_path: Path) -> None:

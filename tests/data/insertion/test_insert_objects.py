@@ -13,11 +13,12 @@ from torch.utils.data import DataLoader
 
 from asca_pillars.base.errors import ConfigError, DatasetError
 from asca_pillars.cli.prepare import prepare
-from asca_pillars.config.tree import Config
+from asca_pillars.config.tree import Config, DataConfig
 from asca_pillars.data.augment import augment
 from asca_pillars.data.boxes.box_records import json_line, records_from
 from asca_pillars.data.boxes.box_split import BoxSplit
 from asca_pillars.data.frames import LabeledFrame, read_frame, within_ranges
+from asca_pillars.data.insertion.gt_database import prepare_database
 from asca_pillars.data.insertion.insert_objects import Inserter, insert_objects, insertion_shares
 from asca_pillars.data.kitti import (
     KittiSplit,
@@ -248,6 +249,16 @@ def test_a_class_without_objects_is_named(tmp_path: Path) -> None:
 def test_impossible_proportions_are_refused(proportions: dict[str, float], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         config("rs_aug", proportions=proportions)
+
+
+def test_the_database_is_built_by_as_many_processes_as_load(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[int] = []
+    monkeypatch.setattr(
+        "asca_pillars.data.insertion.insert_objects.prepare_database",
+        lambda *args, workers, **more: asked.append(workers) or prepare_database(*args, **more),
+    )
+    open_inserter(KittiSplit(root, "train"), dataclasses.replace(config("gt_aug"), data=DataConfig(workers=3)))
+    assert asked == [3]
 
 
 def test_prepare_leaves_nothing_for_training_to_compute(
