@@ -40,12 +40,19 @@ def source(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return path
 
 
-def hits(source: Path) -> list[bool]:
-    """Return for both kinds of functions whether a process that imports and calls them takes them from the cache."""
+def imported(source: Path, before: Callable[[Any], object] = lambda module: None) -> Any:
+    """The module, as a process of its own would import it; `before` that gets it still empty."""
     spec = spec_from_file_location("made_up_kernels", source)
     assert spec is not None and spec.loader is not None
-    module: Any = module_from_spec(spec)
+    module = module_from_spec(spec)
+    before(module)
     spec.loader.exec_module(module)
+    return module
+
+
+def hits(source: Path) -> list[bool]:
+    """Return for both kinds of functions whether a process that imports and calls them takes them from the cache."""
+    module = imported(source)
     assert (module.double(21), module.triple(14)) == (42, 42)
     return [bool(function.stats.cache_hits) for function in (module.double, module.triple)]
 
@@ -63,11 +70,9 @@ def flip(at: float) -> Callable[[bytes], bytes]:
     "damage",
     [
         lambda content: b"",
-        lambda content: content[: len(content) // 2],
         lambda content: content[:-1],
         lambda content: content[:-32],  # as numba itself writes them
         flip(0),
-        flip(0.3),
         flip(0.7),
         flip(1),
         lambda content: b"cos\nsystem\n(S'false'\ntR.",
@@ -87,26 +92,21 @@ def test_a_damaged_cache_is_made_anew(source: Path, suffix: str, damage: Callabl
 def test_a_full_disk_is_named_and_ends_nothing(
     source: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    def fail(name: Any, *_: Any) -> None:
+    def fail(*_: Any) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
     with monkeypatch.context() as full, caplog.at_level(logging.WARNING):
         full.setattr(os, "replace", fail)
         assert hits(source) == [False, False]
     (record,) = caplog.records
-    message = record.getMessage()
-    assert "cache" in message and "No space left on device" in message and "NUMBA_CACHE_DIR" in message
+    for words in ("cache", "No space left on device", "set NUMBA_CACHE_DIR to another folder"):
+        assert words in record.getMessage()
     assert hits(source) == [False, False]
     assert hits(source) == [True, True]
-
-
-def test_a_folder_in_the_place_of_a_file_ends_nothing(source: Path, caplog: pytest.LogCaptureFixture) -> None:
-    hits(source)
     for path in [path for path in (source.parent / "cache").rglob("*") if path.is_file()]:
         path.unlink()
         path.mkdir()
-    assert hits(source) == [False, False]
-    assert "set NUMBA_CACHE_DIR to another folder" in caplog.text
+    assert hits(source) == [False, False], "with a folder in the place of a file"
 
 
 def test_compiled_without_a_cache_where_none_can_be_written(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -135,9 +135,5 @@ def value_of(pair):
 """
     for written in (text, text.replace("Earlier", "Renamed")):
         source.write_text(written)
-        spec = spec_from_file_location("made_up_kernels", source)
-        assert spec is not None and spec.loader is not None
-        module = module_from_spec(spec)
-        monkeypatch.setitem(sys.modules, "made_up_kernels", module)
-        spec.loader.exec_module(module)
+        module = imported(source, lambda made: monkeypatch.setitem(sys.modules, "made_up_kernels", made))
         assert module.value_of(module.Pair(3)) == 3

@@ -43,10 +43,6 @@ def _checkpoint(path: Path) -> Any:
     return load_checkpoint(path) if path.suffix == ".ckpt" else read_foreign(path)
 
 
-def _image_size(path: Path) -> Any:
-    return KittiSplit(path.parents[2]).image_size_wh(path.stem)
-
-
 READERS: dict[str, Callable[[Path], Any]] = {
     **{f"scan{suffix}": read_scan for suffix in SCAN_SUFFIXES},
     **{f"drive{suffix}": open_recording for suffix in (".mcap", ".db3", ".bag", ".mcap.zstd", ".db3.zst")},
@@ -59,7 +55,7 @@ READERS: dict[str, Callable[[Path], Any]] = {
     "config.yaml": load_config,
     "simulation.yaml": lambda path: load_simulation_config(str(path)),
     "ImageSets/val.txt": lambda path: read_image_set(path.parents[1], path.stem),
-    "training/image_2/000000.png": _image_size,
+    "training/image_2/000000.png": lambda path: KittiSplit(path.parents[2]).image_size_wh(path.stem),
     "bundle.json": _copied_bundle,
     "encoder.onnx": _copied_bundle,
     "last.ckpt": _checkpoint,
@@ -108,12 +104,15 @@ def test_sockets_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
 
 
 def test_a_byte_order_mark_is_no_content(tmp_path: Path) -> None:
-    (tmp_path / "a.txt").write_bytes(b"\xef\xbb\xbf1")
-    assert read_text(tmp_path / "a.txt", AscaError) == "1"
-    (tmp_path / "pose.txt").write_bytes(b"\xef\xbb\xbf1 0 0 0\r\n0 1 0 0\r\n0 0 1 0\r\n0 0 0 1\r\n")
-    assert read_pose(tmp_path / "pose.txt")[0] == (1, 0, 0, 0)
-    (tmp_path / "config.yaml").write_bytes(b"\xef\xbb\xbfname: marked\r\n")
-    assert load_config(tmp_path / "config.yaml").name == "marked"
     manifest = (default_bundle_path() / "bundle.json").read_bytes()
-    (tmp_path / "bundle.json").write_bytes(b"\xef\xbb\xbf" + manifest)
+    for name, content in (
+        ("a.txt", b"1"),
+        ("pose.txt", b"1 0 0 0\r\n0 1 0 0\r\n0 0 1 0\r\n0 0 0 1\r\n"),
+        ("config.yaml", b"name: marked\r\n"),
+        ("bundle.json", manifest),
+    ):
+        (tmp_path / name).write_bytes(b"\xef\xbb\xbf" + content)
+    assert read_text(tmp_path / "a.txt", AscaError) == "1"
+    assert read_pose(tmp_path / "pose.txt")[0] == (1, 0, 0, 0)
+    assert load_config(tmp_path / "config.yaml").name == "marked"
     assert _copied_bundle(tmp_path / "bundle.json").name == load_bundle(default_bundle_path()).name

@@ -34,11 +34,8 @@ def assert_same_bits(first: Pillars, second: Pillars) -> None:
 
 def border_values(grid: PillarGrid) -> list[np.ndarray]:
     """Along x, y and z: every border there is, and the float32 numbers next to it."""
-    edges = [grid.x_edges_m, grid.y_edges_m, np.array(grid.z_range_m)]
-    return [
-        np.concatenate([e, np.nextafter(e, np.float32(-100)), np.nextafter(e, np.float32(100))])
-        for e in (axis.astype(np.float32) for axis in edges)
-    ]
+    edges = (axis.astype(np.float32) for axis in (grid.x_edges_m, grid.y_edges_m, np.array(grid.z_range_m)))
+    return [np.concatenate([e, *(np.nextafter(e, np.float32(end)) for end in (-100, 100))]) for e in edges]
 
 
 def cloud(seed: int, count: int, spread_m: float, grid: PillarGrid, odd: float) -> np.ndarray:
@@ -70,25 +67,17 @@ def test_pillars_are_the_same(
 
 @pytest.mark.parametrize("grid", [*GRIDS, PillarGrid()], ids=lambda grid: f"{grid.nx}x{grid.ny}")
 def test_points_on_borders_fall_into_the_same_pillars(grid: PillarGrid) -> None:
-    x, y, z = border_values(grid)
-    along = np.column_stack([x, np.full_like(x, y[3]), np.zeros_like(x), np.zeros_like(x)])
-    across = np.column_stack([np.full_like(y, x[3]), y, np.zeros_like(y), np.zeros_like(y)])
-    upward = np.column_stack([np.full_like(z, x[3]), np.full_like(z, y[3]), z, np.zeros_like(z)])
-    points = np.concatenate([along, across, upward])
+    values = border_values(grid)
+    lines = []
+    for axis, along in enumerate(values):
+        line = np.zeros((len(along), 4), np.float32)
+        line[:, :2] = values[0][3], values[1][3]
+        line[:, axis] = along
+        lines.append(line)
+    points = np.concatenate(lines)
     pillars = pillarize(points, grid, LIMITS[0])
     assert pillars.stats.pillars >= grid.nx + grid.ny - 1 and pillars.stats.points_outside > 0
     assert_same_bits(pillars, by_numpy(pillarize, points, grid, LIMITS[0]))
-
-
-def test_real_sizes_are_the_same() -> None:
-    # More pillars than the limit, and crowds: a cloud dense at the sensor and thin far from it.
-    rng = np.random.default_rng(7)
-    distance, angle = 70 * rng.random(60_000) ** 2, rng.uniform(-1.4, 1.4, 60_000)
-    columns = (distance * np.cos(angle), distance * np.sin(angle), rng.normal(-1, 0.7, 60_000), rng.random(60_000))
-    points = np.column_stack(columns).astype(np.float32)
-    pillars = pillarize(points, PillarGrid(), PillarLimits(10_000, 32))
-    assert pillars.stats.pillars_over_limit > 0 and pillars.point_counts.max() == 32
-    assert_same_bits(pillars, by_numpy(pillarize, points, PillarGrid(), PillarLimits(10_000, 32)))
 
 
 def test_memory_that_numba_does_not_know_is_copied() -> None:

@@ -7,7 +7,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from multiprocessing.context import SpawnProcess
 from pathlib import Path
 
@@ -31,11 +31,9 @@ def squares(count: int, workers: int, at_once: int = 4) -> Iterator[tuple[int, i
 def test_results_come_in_order_from_processes_of_one_thread(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("OPENBLAS_NUM_THREADS", "3")
     monkeypatch.delenv("OPENCV_FOR_THREADS_NUM", raising=False)
-    found = list(squares(50, 2))
-    assert [result for result, _, _ in found] == [number * number for number in range(50)]
-    processes = {process for _, process, _ in found}
-    assert len(processes) in (1, 2) and os.getpid() not in processes  # one may be quicker than the other's start
-    assert {threads for _, _, threads in found} == {1}
+    results, processes, threads = zip(*squares(50, 2), strict=True)
+    assert results == tuple(number * number for number in range(50)) and set(threads) == {1}
+    assert len(set(processes)) in (1, 2) and os.getpid() not in processes  # one may be quicker than the other's start
     assert os.environ["OPENBLAS_NUM_THREADS"] == "3" and "OPENCV_FOR_THREADS_NUM" not in os.environ
 
 
@@ -58,13 +56,6 @@ def killed(number: int) -> int:
     if number == 5:
         os.kill(os.getpid(), signal.SIGKILL)
     return number
-
-
-def test_a_process_that_is_killed_ends_the_work() -> None:
-    """The kernel does that where memory runs out; the pool of the standard library then waits forever."""
-    results = map_in_processes(killed, range(40), 2, "Killed", progress=False)
-    with pytest.raises(WorkerError, match=r"1 of 2 worker processes were killed, .*; use fewer workers"):
-        list(results)
 
 
 def unhurried(number: int) -> int:
@@ -97,9 +88,17 @@ def fails_oddly(number: int) -> int:
     return number
 
 
-def test_an_error_that_cannot_be_sent_ends_the_work() -> None:
-    with pytest.raises(TypeError, match="second"):
-        list(map_in_processes(fails_oddly, range(40), 2, "Odd", progress=False))
+@pytest.mark.parametrize(
+    ("job", "error", "message"),
+    [
+        # The kernel kills where memory runs out; the pool of the standard library then waits forever.
+        (killed, WorkerError, r"1 of 2 worker processes were killed, .*; use fewer workers"),
+        (fails_oddly, TypeError, "second"),
+    ],
+)
+def test_what_befalls_a_process_ends_the_work(job: Callable[[int], int], error: type[Exception], message: str) -> None:
+    with pytest.raises(error, match=message):
+        list(map_in_processes(job, range(40), 2, "Jobs", progress=False))
 
 
 def test_a_process_that_cannot_be_started_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -141,12 +140,6 @@ def test_processes_end_with_the_one_that_started_them(tmp_path: Path) -> None:
         main.communicate(timeout=30)  # until the last process that could write there has ended
 
 
-def test_the_job_is_sent_once(tmp_path: Path) -> None:
-    job = Noting(tmp_path)
-    assert list(map_in_processes(job, range(8), 2, "Noting", at_once=1, progress=False)) == [0, 1, 2, 3, 4, 5, 6, 7]
-    assert len(list(tmp_path.iterdir())) == 2
-
-
 class Noting:
     """A job that leaves a file where it is unpickled."""
 
@@ -166,3 +159,9 @@ class Noting:
 def noted(folder: Path) -> Noting:
     (folder / str(os.getpid())).touch(exist_ok=False)
     return Noting(folder)
+
+
+def test_the_job_is_sent_once(tmp_path: Path) -> None:
+    job = Noting(tmp_path)
+    assert list(map_in_processes(job, range(8), 2, "Noting", at_once=1, progress=False)) == [*range(8)]
+    assert len(list(tmp_path.iterdir())) == 2

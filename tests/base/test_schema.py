@@ -44,68 +44,42 @@ def refusal(data: dict[str, Any]) -> str:
     return str(caught.value)
 
 
-def test_nested_data_becomes_dataclasses() -> None:
-    data = {"name": "van", "engine": {"power_kw": 60}, "wheels": [{"radius_m": 0.3}, {"radius_m": 0.4, "spokes": 8}]}
-    vehicle = parse(Vehicle, data, "car.yaml")
-    assert vehicle == Vehicle("van", Engine(60.0), wheels=(Wheel(0.3), Wheel(0.4, 8)))
-    assert isinstance(vehicle.engine.power_kw, float)
+WHEEL = {"radius_m": 0.3}
 
 
 @pytest.mark.parametrize(
     ("data", "message"),
     [
         ({"nam": "van"}, "unknown key `nam`; did you mean `name`?"),
-        ({"name": "van", "engine": {"powr_kw": 3}}, "unknown key `engine.powr_kw`; did you mean `power_kw`?"),
-        ({"name": "van", "spare": {"power": 3}}, "unknown key `spare.power`; did you mean `power_kw`?"),
-        (
-            {"name": "van", "wheels": [{"radius_m": 0.3}, {"radius_m": 0.3, "spoke": 8}]},
-            "unknown key `wheels.1.spoke`; did you mean `spokes`?",
-        ),
-        ({"name": "van", "wheels": [{"radus_m": 0.3}]}, "unknown key `wheels.0.radus_m`; did you mean `radius_m`?"),
-        ({"name": "van", "engine": {"zzz": 3}}, "unknown key `engine.zzz`; known keys: power_kw"),
-        ({"name": "van", "wheels[0]": 1}, "unknown key `wheels[0]`; did you mean `wheels`?"),
-        ({"name": "van", "engine": {"[key]": 1}}, "unknown key `engine.[key]`; known keys: power_kw"),
-    ],
-)
-def test_unknown_keys(data: dict[str, Any], message: str) -> None:
-    assert refusal(data) == f"car.yaml: {message}"
-
-
-@pytest.mark.parametrize(
-    ("data", "message"),
-    [
-        ({}, "missing key `name`"),
-        ({"name": "van", "wheels": [{"spokes": 3}]}, "missing key `wheels.0.radius_m`"),
-        ({"name": "van", "span_m": [1.0]}, "missing key `span_m.1`"),
-        (
-            {"name": "van", "engine": {"power_kw": "strong"}},
-            "`engine.power_kw` = 'strong': input should be a valid number",
-        ),
-        ({"name": "van", "engine": 3}, "`engine` = 3: input should be a dictionary"),
-        (
-            {"name": "van", "wheels": [{"radius_m": 0.3, "spokes": 2.5}]},
-            "`wheels.0.spokes` = 2.5: input should be a valid int",
-        ),
+        ({"engine": {"powr_kw": 3}}, "unknown key `engine.powr_kw`; did you mean `power_kw`?"),
+        ({"wheels": [WHEEL, WHEEL | {"spoke": 8}]}, "unknown key `wheels.1.spoke`; did you mean `spokes`?"),
+        ({"engine": {"zzz": 3}}, "unknown key `engine.zzz`; known keys: power_kw"),
+        ({"engine": {"[key]": 1}}, "unknown key `engine.[key]`; known keys: power_kw"),
+        ({"spare": {"power": 3}}, "unknown key `spare.power`; did you mean `power_kw`?"),
+        ({"wheels[0]": 1}, "unknown key `wheels[0]`; did you mean `wheels`?"),
+        ({"wheels": [{"spokes": 3}]}, "missing key `wheels.0.radius_m`"),
+        ({"span_m": [1.0]}, "missing key `span_m.1`"),
+        ({"engine": {"power_kw": "strong"}}, "`engine.power_kw` = 'strong': input should be a valid number"),
+        ({"engine": 3}, "`engine` = 3: input should be a dictionary"),
+        ({"wheels": [WHEEL | {"spokes": 2.5}]}, "`wheels.0.spokes` = 2.5: input should be a valid int"),
         ({"name": None}, "`name` = None: input should be a valid string"),
-        ({"name": "van", "notes": {1: "x"}}, "`notes.1` = 1: input should be a valid string"),
-        ({"name": "van", 3: 4}, "`3` = 3: keys should be strings"),
-        ({"name": "van", "engine": {"power_kw": 0}}, "power_kw 0 must be positive"),
-        ({"name": "van", "engine": {"power_kw": True}}, "`engine.power_kw` = true: input should be a number"),
-        (
-            {"name": "van", "wheels": [{"radius_m": 0.3}, {"radius_m": 0.3, "spokes": False}]},
-            "`wheels.1.spokes` = false: input should be a number",
-        ),
+        ({"notes": {1: "x"}}, "`notes.1` = 1: input should be a valid string"),
+        ({3: 4}, "`3` = 3: keys should be strings"),
+        ({"engine": {"power_kw": 0}}, "power_kw 0 must be positive"),
+        ({"engine": {"power_kw": True}}, "`engine.power_kw` = true: input should be a number"),
+        ({"wheels": [WHEEL, WHEEL | {"spokes": False}]}, "`wheels.1.spokes` = false: input should be a number"),
     ],
 )
-def test_missing_and_wrong_values(data: dict[str, Any], message: str) -> None:
-    assert refusal(data).startswith(f"car.yaml: {message}")
+def test_a_mistake_is_one_line_that_names_the_key(data: dict[str, Any], message: str) -> None:
+    assert refusal({"name": "van"} | data).startswith(f"car.yaml: {message}")
 
 
 def test_a_misspelt_key_is_told_before_what_it_leaves_missing() -> None:
+    assert refusal({}).startswith("car.yaml: missing key `name`")
     assert "`nme`" in refusal({"nme": "van", "engine": {"power_kw": "strong"}})
 
 
-def test_round_trip() -> None:
+def test_nested_data_becomes_dataclasses_and_back() -> None:
     vehicle = Vehicle("van", Engine(60.0), Engine(1.0), (Wheel(0.3), Wheel(0.4, 8)), (1.0, 2.0), {"a": "b"})
     plain = to_dict(vehicle)
     assert plain == {
@@ -117,6 +91,8 @@ def test_round_trip() -> None:
         "notes": {"a": "b"},
     }
     assert parse(Vehicle, plain, "car.yaml") == vehicle
+    whole = parse(Vehicle, {"name": "van", "engine": {"power_kw": 60}, "wheels": [{"radius_m": 1}]}, "car.yaml")
+    assert whole == Vehicle("van", Engine(60.0), wheels=(Wheel(1.0),)) and isinstance(whole.engine.power_kw, float)
 
 
 @dataclass(frozen=True)
@@ -139,14 +115,18 @@ class Holder(Strict):
     ] = field(default_factory=Round)
 
 
-def test_a_tagged_union_is_read_by_its_kind_and_blamed_without_its_tag() -> None:
+@pytest.mark.parametrize(
+    ("shape", "message"),
+    [
+        ({"kind": "square", "side_m": "wide"}, "`shape.side_m` = 'wide': input should be a valid number"),
+        ({"radus_m": 1}, "unknown key `shape.radus_m`; did you mean `radius_m`?"),
+        ({"kind": "square", "sid_m": 1}, "unknown key `shape.sid_m`; did you mean `side_m`?"),
+        ({"kind": "triangle"}, "`shape.kind` = 'triangle': input should be 'round', 'square'"),
+    ],
+)
+def test_a_tagged_union_is_read_by_its_kind_and_blamed_without_its_tag(shape: dict[str, Any], message: str) -> None:
     assert parse(Holder, {"shape": {"radius_m": 2}}, "f").shape == Round(radius_m=2)
     assert parse(Holder, {"shape": {"kind": "square", "side_m": 2}}, "f").shape == Square(side_m=2)
-    with pytest.raises(ConfigError, match=r"^f: `shape.side_m` = 'wide': input should be a valid number"):
-        parse(Holder, {"shape": {"kind": "square", "side_m": "wide"}}, "f")
-    with pytest.raises(ConfigError, match=r"^f: unknown key `shape.radus_m`; did you mean `radius_m`\?$"):
-        parse(Holder, {"shape": {"radus_m": 1}}, "f")
-    with pytest.raises(ConfigError, match=r"^f: unknown key `shape.sid_m`; did you mean `side_m`\?$"):
-        parse(Holder, {"shape": {"kind": "square", "sid_m": 1}}, "f")
-    with pytest.raises(ConfigError, match=r"^f: `shape.kind` = 'triangle': input should be 'round', 'square'"):
-        parse(Holder, {"shape": {"kind": "triangle"}}, "f")
+    with pytest.raises(ConfigError) as caught:
+        parse(Holder, {"shape": shape}, "f")
+    assert str(caught.value).startswith(f"f: {message}")

@@ -38,33 +38,35 @@ def write(path: Path, text: str) -> None:
     path.write_text(text)
 
 
-def test_quota_of_cgroup_v2_is_the_smallest_on_the_way_up(tmp_path: Path) -> None:
-    write(tmp_path / "proc/self/cgroup", "0::/pod/job\n")
-    write(tmp_path / "cgroup/pod/job/cpu.max", "max 100000\n")
-    write(tmp_path / "cgroup/pod/cpu.max", "250000 100000\n")
-    assert system.cpu_quota(tmp_path / "proc", tmp_path / "cgroup") == 2.5
+QUOTAS = {
+    "the smallest on the way up": (
+        "0::/pod/job\n",
+        {"pod/job/cpu.max": "max 100000\n", "pod/cpu.max": "250000 100000\n"},
+        2.5,
+    ),
+    "version 1": (
+        "9:memory:/job\n4:cpu,cpuacct:/job\n0::/\n",
+        {
+            "cpu,cpuacct/job/cpu.cfs_quota_us": "300000\n",
+            "cpu,cpuacct/job/cpu.cfs_period_us": "100000\n",
+            "cpu,cpuacct/cpu.cfs_quota_us": "-1\n",
+            "cpu,cpuacct/cpu.cfs_period_us": "100000\n",
+        },
+        3.0,
+    ),
+    "a container that sees the host's path": ("0::/host/only/path\n", {"cpu.max": "150000 100000\n"}, 1.5),
+    "no limit": ("0::/\n", {"cpu.max": "max 100000\n"}, math.inf),
+}
 
 
-def test_quota_of_cgroup_v1(tmp_path: Path) -> None:
-    write(tmp_path / "proc/self/cgroup", "9:memory:/job\n4:cpu,cpuacct:/job\n0::/\n")
-    write(tmp_path / "cgroup/cpu,cpuacct/job/cpu.cfs_quota_us", "300000\n")
-    write(tmp_path / "cgroup/cpu,cpuacct/job/cpu.cfs_period_us", "100000\n")
-    write(tmp_path / "cgroup/cpu,cpuacct/cpu.cfs_quota_us", "-1\n")
-    write(tmp_path / "cgroup/cpu,cpuacct/cpu.cfs_period_us", "100000\n")
-    assert system.cpu_quota(tmp_path / "proc", tmp_path / "cgroup") == 3.0
-
-
-def test_quota_in_a_container_that_sees_the_hosts_path(tmp_path: Path) -> None:
-    write(tmp_path / "proc/self/cgroup", "0::/host/only/path\n")
-    write(tmp_path / "cgroup/cpu.max", "150000 100000\n")
-    assert system.cpu_quota(tmp_path / "proc", tmp_path / "cgroup") == 1.5
-
-
-def test_no_quota(tmp_path: Path) -> None:
-    assert system.cpu_quota(tmp_path, tmp_path) == math.inf
-    write(tmp_path / "self/cgroup", "0::/\n")
-    write(tmp_path / "cpu.max", "max 100000\n")
-    assert system.cpu_quota(tmp_path, tmp_path) == math.inf
+@pytest.mark.parametrize("case", QUOTAS)
+def test_quota_of_cgroups(tmp_path: Path, case: str) -> None:
+    groups, files, quota = QUOTAS[case]
+    assert system.cpu_quota(tmp_path / "proc", tmp_path / "cgroup") == math.inf
+    write(tmp_path / "proc/self/cgroup", groups)
+    for name, text in files.items():
+        write(tmp_path / "cgroup" / name, text)
+    assert system.cpu_quota(tmp_path / "proc", tmp_path / "cgroup") == quota
 
 
 @pytest.mark.parametrize(("quota", "threads"), [(math.inf, 4), (2.9, 2), (0.5, 1), (64.0, 4)])

@@ -1,5 +1,7 @@
 """Augmentation: objects keep their points, headings and distances from each other, and nothing else moves."""
 
+import copy
+import dataclasses
 import math
 from dataclasses import replace
 
@@ -7,31 +9,33 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 
 from asca_pillars.config.tree import AugmentConfig
-from asca_pillars.data.augment import augment, flip_y, move_objects, rotate, scale
+from asca_pillars.data.augment import (
+    FEWEST_POINTS,
+    augment,
+    corrupt_objects,
+    drop_reflectance,
+    flip_y,
+    move_objects,
+    rotate,
+    scale,
+)
 from asca_pillars.data.frames import LabeledFrame
 from asca_pillars.geometry.boxes import points_in_boxes
+from asca_pillars.geometry.frame_change import FrameChange
 from asca_pillars.geometry.overlap import bev_intersection
 from tests.helpers.scenes import make_scene
 
 STILL = AugmentConfig(
-    flip_probability=0,
-    rotation_rad=0,
-    scale=(1, 1),
-    shift_z_m=0,
-    object_rotation_rad=0,
-    object_shift_m=0,
+    flip_probability=0, rotation_rad=0, scale=(1, 1), shift_z_m=0, object_rotation_rad=0, object_shift_m=0,
     point_dropout=0,
-)
+)  # fmt: skip
 STRONG = AugmentConfig(
     rotation_rad=math.pi, scale=(0.8, 1.25), shift_z_m=0.5, object_rotation_rad=1.0, object_shift_m=0.5
 )
 POINTS_PER_BOX = 25
-
-
-def copy_of(frame: LabeledFrame) -> LabeledFrame:
-    return replace(frame, points=frame.points.copy(), boxes=frame.boxes.copy())
 
 
 def points_of(frame: LabeledFrame, index: int) -> np.ndarray:
@@ -56,20 +60,15 @@ def frames(draw: st.DrawFn) -> LabeledFrame:
         size = rng.uniform((0.5, 0.5, 1.0), (4.5, 2.0, 2.0))
         yaw = draw(st.one_of(st.sampled_from([-math.pi, math.pi, math.pi / 2, 0.0]), st.floats(-math.pi, math.pi)))
         yaw = float(np.clip(np.float32(yaw), np.float32(-3.1415925), np.float32(3.1415925)))
-        box = np.array(
-            [7 * column + rng.uniform(-1, 1), 7 * row + rng.uniform(-1, 1), rng.uniform(-1.5, 0), *size, yaw]
-        )
-        inside = rng.uniform(-0.45, 0.45, (POINTS_PER_BOX, 3)) * size
-        cos, sin = math.cos(yaw), math.sin(yaw)
-        inside[:, :2] = inside[:, :2] @ np.array([[cos, sin], [-sin, cos]])
+        box = [7 * column + rng.uniform(-1, 1), 7 * row + rng.uniform(-1, 1), rng.uniform(-1.5, 0), *size, yaw]
+        inside = FrameChange.turn(yaw).points(rng.uniform(-0.45, 0.45, (POINTS_PER_BOX, 3)) * size)
         points.append(np.column_stack([inside + box[:3], np.full(POINTS_PER_BOX, (index + 1) / 100)]))
         boxes.append(box)
     array = np.array(boxes, np.float32).reshape(-1, 7)
     ground = rng.uniform((-20, -35, -2, 0.5), (60, 35, -1.5, 1.0), (200, 4)).astype(np.float32)
     ground = ground[~points_in_boxes(ground, array, margin_m=0.05).any(axis=1)]
-    cloud = np.concatenate([ground, *points]).astype(np.float32)
-    order = rng.permutation(len(cloud))
-    return LabeledFrame("000007", cloud[order], array, np.arange(len(array)) % 4 - 1)
+    cloud = rng.permutation(np.concatenate([ground, *points]).astype(np.float32))
+    return LabeledFrame("000007", cloud, array, np.arange(len(array)) % 4 - 1)
 
 
 def assert_objects_kept(before: LabeledFrame, after: LabeledFrame, mirrored: bool = False, factor: float = 1.0) -> None:
@@ -88,7 +87,7 @@ def assert_objects_kept(before: LabeledFrame, after: LabeledFrame, mirrored: boo
 @settings(max_examples=30)
 @given(frames())
 def test_flip(frame: LabeledFrame) -> None:
-    flipped = copy_of(frame)
+    flipped = copy.deepcopy(frame)
     flip_y(flipped)
     assert_objects_kept(frame, flipped, mirrored=True)
     mirror = np.array([1, -1, 1, 1], np.float32)
@@ -99,7 +98,7 @@ def test_flip(frame: LabeledFrame) -> None:
 @settings(max_examples=30)
 @given(frames(), st.floats(-2 * math.pi, 2 * math.pi), st.booleans())
 def test_rotation(frame: LabeledFrame, angle_rad: float, numpy_scalar: bool) -> None:
-    turned = copy_of(frame)
+    turned = copy.deepcopy(frame)
     rotate(turned, np.float64(angle_rad) if numpy_scalar else angle_rad)
     assert_objects_kept(frame, turned)
     cos, sin = math.cos(angle_rad), math.sin(angle_rad)
@@ -110,36 +109,18 @@ def test_rotation(frame: LabeledFrame, angle_rad: float, numpy_scalar: bool) -> 
 
 
 @pytest.mark.parametrize("kind", [float, np.float64])
-def test_half_a_turn_ends_below_pi(kind: type) -> None:
+@pytest.mark.parametrize("angle_rad", [math.pi, -math.pi, np.nextafter(math.pi, 0), math.pi - 1e-8])
+def test_half_a_turn_ends_below_pi(angle_rad: float, kind: type) -> None:
     """The float32 next to pi lies above it: no yaw may round to it."""
-    frame = LabeledFrame("0", np.empty((0, 4), np.float32), np.zeros((1, 7), np.float32), np.zeros(1, np.int64))
-    for angle_rad in (math.pi, -math.pi, np.nextafter(math.pi, 0), math.pi - 1e-8):
-        turned = copy_of(frame)
-        rotate(turned, kind(angle_rad))
-        assert -math.pi <= float(turned.boxes[0, 6]) < math.pi
-
-
-def test_directions_by_hand() -> None:
-    """A car ahead to the left that drives to the left, and a point at its front."""
-    point, box = [10.0, 7.0, -1.0, 0.5], [10.0, 5.0, -1.0, 4.0, 1.8, 1.5, math.pi / 2]
-    frame = LabeledFrame("0", np.array([point], np.float32), np.array([box], np.float32), np.zeros(1, np.int64))
-    flipped, turned, scaled = copy_of(frame), copy_of(frame), copy_of(frame)
-    flip_y(flipped)
-    np.testing.assert_allclose(flipped.boxes[0], [10, -5, -1, 4, 1.8, 1.5, -math.pi / 2], rtol=1e-6)
-    np.testing.assert_allclose(flipped.points[0], [10, -7, -1, 0.5])
-    rotate(turned, math.pi / 2)  # counter-clockwise: what was ahead is to the left, what drove left drives back
-    np.testing.assert_allclose(turned.boxes[0, :6], [-5, 10, -1, 4, 1.8, 1.5], rtol=1e-6)
-    assert abs(turned.boxes[0, 6]) == pytest.approx(math.pi, abs=1e-6)
-    np.testing.assert_allclose(turned.points[0], [-7, 10, -1, 0.5], rtol=1e-6)
-    scale(scaled, 1.1)
-    np.testing.assert_allclose(scaled.boxes[0], [11, 5.5, -1.1, 4.4, 1.98, 1.65, math.pi / 2], rtol=1e-6)
-    np.testing.assert_allclose(scaled.points[0], [11, 7.7, -1.1, 0.5], rtol=1e-6)
+    turned = frame_of(np.zeros(7))
+    rotate(turned, kind(angle_rad))
+    assert -math.pi <= float(turned.boxes[0, 6]) < math.pi
 
 
 @settings(max_examples=30)
 @given(frames(), st.floats(0.5, 2.0))
 def test_scaling(frame: LabeledFrame, factor: float) -> None:
-    scaled = copy_of(frame)
+    scaled = copy.deepcopy(frame)
     scale(scaled, factor)
     assert_objects_kept(frame, scaled, factor=factor)
     np.testing.assert_allclose(scaled.points[:, :3], frame.points[:, :3] * factor, rtol=1e-6)
@@ -149,10 +130,9 @@ def test_scaling(frame: LabeledFrame, factor: float) -> None:
 @settings(max_examples=30)
 @given(frames(), st.integers(0, 2**32 - 1), st.floats(0, 1.5), st.floats(0, math.pi))
 def test_moved_objects(frame: LabeledFrame, seed: int, shift_m: float, turn_rad: float) -> None:
-    moved = copy_of(frame)
-    move_objects(
-        moved, AugmentConfig(object_shift_m=shift_m, object_rotation_rad=turn_rad), np.random.default_rng(seed)
-    )
+    moved = copy.deepcopy(frame)
+    config = AugmentConfig(object_shift_m=shift_m, object_rotation_rad=turn_rad)
+    move_objects(moved, config, np.random.default_rng(seed))
     assert_objects_kept(frame, moved)
     shared = bev_intersection(moved.boxes, moved.boxes)
     assert not shared[~np.eye(len(shared), dtype=bool)].any()
@@ -162,16 +142,19 @@ def test_moved_objects(frame: LabeledFrame, seed: int, shift_m: float, turn_rad:
         assert np.array_equal(moved.boxes, frame.boxes)
 
 
+def frame_of(boxes: object, points: object = ()) -> LabeledFrame:
+    array = np.array(boxes, np.float32).reshape(-1, 7)
+    return LabeledFrame("0", np.array(points, np.float32).reshape(-1, 4), array, np.zeros(len(array), np.int64))
+
+
 def test_objects_move_as_far_as_asked() -> None:
-    shifts, turns = [], []
-    box = np.array([[20, 3, -1, 4, 2, 1.5, 0.5]], np.float32)
-    config = AugmentConfig(object_shift_m=0.3, object_rotation_rad=0.2)
-    rng = np.random.default_rng(0)
-    for _ in range(400):
-        frame = LabeledFrame("0", np.empty((0, 4), np.float32), box.copy(), np.zeros(1, np.int64))
+    box = np.array([20, 3, -1, 4, 2, 1.5, 0.5], np.float32)
+    config, rng = AugmentConfig(object_shift_m=0.3, object_rotation_rad=0.2), np.random.default_rng(0)
+    moved = [frame_of(box) for _ in range(400)]
+    for frame in moved:
         move_objects(frame, config, rng)
-        shifts.append(frame.boxes[0, :3] - box[0, :3])
-        turns.append(frame.boxes[0, 6] - 0.5)
+    differences = np.array([frame.boxes[0] - box for frame in moved])
+    shifts, turns = differences[:, :3], differences[:, 6]
     # Normal with sigma 0.3 along each axis; uniform within 0.2, whose standard deviation is 0.2 / sqrt(3).
     np.testing.assert_allclose(np.std(shifts, axis=0), 0.3, rtol=0.15)
     np.testing.assert_allclose(np.mean(shifts, axis=0), 0, atol=0.06)
@@ -182,10 +165,10 @@ def test_objects_in_a_crowd_do_not_collide() -> None:
     """Nine people 0.3 m apart, drawn to shift by as much as their own size: some draws collide, none is taken."""
     x, y = np.meshgrid([10.0, 10.9, 11.8], [-0.9, 0.0, 0.9])
     boxes = np.column_stack([x.ravel(), y.ravel(), np.tile([-0.8, 0.6, 0.6, 1.7, 0.1], (9, 1))]).astype(np.float32)
-    config = AugmentConfig(object_shift_m=0.5, object_rotation_rad=1.0)
     moves = 0
     for seed in range(20):
-        frame = LabeledFrame("0", np.empty((0, 4), np.float32), boxes.copy(), np.zeros(9, np.int64))
+        frame = frame_of(boxes)
+        config = AugmentConfig(object_shift_m=0.5, object_rotation_rad=1.0)
         move_objects(frame, config, np.random.default_rng(seed))
         shared = bev_intersection(frame.boxes, frame.boxes)
         assert not shared[~np.eye(9, dtype=bool)].any()
@@ -195,21 +178,20 @@ def test_objects_in_a_crowd_do_not_collide() -> None:
 
 def test_an_object_without_room_stays() -> None:
     """A post in the middle of a house: wherever it is drawn to, it is inside."""
-    boxes = np.array([[10, 0, 0, 0.5, 0.5, 2, 0.3], [10, 0, 0, 60, 60, 3, 0]], np.float32)
-    points = np.array([[10, 0, 0, 0.01], [14, 3, 0, 0.9]], np.float32)
-    frame = LabeledFrame("0", points.copy(), boxes.copy(), np.zeros(2, np.int64))
+    frame = frame_of([[10, 0, 0, 0.5, 0.5, 2, 0.3], [10, 0, 0, 60, 60, 3, 0]], [[10, 0, 0, 0.01], [14, 3, 0, 0.9]])
+    before = copy.deepcopy(frame)
     move_objects(frame, AugmentConfig(), np.random.default_rng(0))
-    assert np.array_equal(frame.boxes, boxes) and np.array_equal(frame.points, points)
+    assert np.array_equal(frame.boxes, before.boxes) and np.array_equal(frame.points, before.points)
 
 
 def test_points_of_overlapping_boxes_are_not_torn_off() -> None:
     """A point in two labelled boxes goes with the first; the second, when it moves, does not take it away again."""
-    boxes = np.array([[10, 0, 0, 4, 2, 2, 0], [10, 1.5, 0, 4, 2, 2, 0]], np.float32)
-    points = np.array([[11, 0.75, 0.5, 0.01], [9, -0.5, 0, 0.01], [9, 2.0, 0, 0.02]], np.float32)
-    frame = LabeledFrame("0", points.copy(), boxes.copy(), np.zeros(2, np.int64))
+    points = [[11, 0.75, 0.5, 0.01], [9, -0.5, 0, 0.01], [9, 2.0, 0, 0.02]]
+    frame = frame_of([[10, 0, 0, 4, 2, 2, 0], [10, 1.5, 0, 4, 2, 2, 0]], points)
+    before = copy.deepcopy(frame)
     move_objects(frame, AugmentConfig(object_shift_m=1.5), np.random.default_rng(1))
-    assert (frame.boxes != boxes).any(axis=1).all()
-    assert_objects_kept(LabeledFrame("0", points, boxes, np.zeros(2, np.int64)), frame)
+    assert (frame.boxes != before.boxes).any(axis=1).all()
+    assert_objects_kept(before, frame)
 
 
 @settings(max_examples=30)
@@ -236,7 +218,8 @@ def test_augmented_objects_keep_their_points(frame: LabeledFrame, seed: int) -> 
 
 def test_seeds_differ_and_half_are_mirrored() -> None:
     points, boxes, _ = make_scene(0)
-    frame = LabeledFrame("0", points, boxes, np.zeros(len(boxes), np.int64))
+    frame = frame_of(boxes, points)
+    assert np.array_equal(augment(frame, STILL, np.random.default_rng(0)).points, points), "nothing is asked"
     results = [augment(frame, replace(STILL, flip_probability=0.5), np.random.default_rng(seed)) for seed in range(100)]
     mirrored = [bool(np.array_equal(result.points[:, 1], -points[:, 1])) for result in results]
     plain = [bool(np.array_equal(result.points, points)) for result in results]
@@ -245,48 +228,30 @@ def test_seeds_differ_and_half_are_mirrored() -> None:
     assert not np.array_equal(first.points, second.points) and not np.array_equal(first.boxes, second.boxes)
 
 
-def test_nothing_asked_changes_nothing() -> None:
-    points, boxes, _ = make_scene(1)
-    after = augment(LabeledFrame("0", points, boxes, np.zeros(4, np.int64)), STILL, np.random.default_rng(0))
-    assert np.array_equal(after.points, points) and np.array_equal(after.boxes, boxes)
-
-
 @pytest.mark.parametrize(
     ("name", "value", "low", "high"),
-    [
-        ("rotation_rad", 0.3, -0.3, 0.3),
-        ("scale", (0.9, 1.3), 0.9, 1.3),
-        ("shift_z_m", 0.2, -0.2, 0.2),
-    ],
+    [("rotation_rad", 0.3, -0.3, 0.3), ("scale", (0.9, 1.3), 0.9, 1.3), ("shift_z_m", 0.2, -0.2, 0.2)],
 )
 def test_draws_fill_their_bounds(name: str, value: object, low: float, high: float) -> None:
-    box = np.array([[10, 0, 0, 1, 1, 1, 0]], np.float32)
-    frame = LabeledFrame("0", np.array([[10, 0, 0, 0.5]], np.float32), box, np.zeros(1, np.int64))
+    frame, rng = frame_of([10, 0, 0, 1, 1, 1, 0], [10, 0, 0, 0.5]), np.random.default_rng(0)
     config = replace(STILL, **{name: value})  # type: ignore[arg-type]
-    rng = np.random.default_rng(0)
     boxes = np.array([augment(frame, config, rng).boxes[0] for _ in range(200)])
     drawn = {"rotation_rad": boxes[:, 6], "scale": boxes[:, 3], "shift_z_m": boxes[:, 2]}
-    for other, values in drawn.items():
-        if other == name:
-            assert low - 1e-6 <= values.min() < low + 0.05 * (high - low)
-            assert high - 0.05 * (high - low) < values.max() <= high + 1e-6
-        else:
-            assert np.ptp(values) == 0
+    values = drawn.pop(name)
+    assert low - 1e-6 <= values.min() < low + 0.05 * (high - low)
+    assert high - 0.05 * (high - low) < values.max() <= high + 1e-6
+    assert all(np.ptp(others) == 0 for others in drawn.values())
 
 
 def test_the_share_of_dropped_points_is_itself_drawn() -> None:
     """Between 0 and `point_dropout`, so half of that on average; boxes stay, the kept points keep their order."""
     points = np.random.default_rng(0).uniform(-20, 20, (4000, 4)).astype(np.float32)
     points[:, 3] = np.arange(4000) / 4000
-    boxes = make_scene(2)[1]
-    frame = LabeledFrame("0", points, boxes, np.zeros(4, np.int64))
-    config = replace(STILL, point_dropout=0.6)
-    shares = []
+    frame, shares = frame_of(make_scene(2)[1], points), []
     for seed in range(60):
-        after = augment(frame, config, np.random.default_rng(seed))
-        assert np.array_equal(after.boxes, boxes)
-        kept = np.isin(points[:, 3], after.points[:, 3])
-        assert np.array_equal(after.points, points[kept])
+        after = augment(frame, replace(STILL, point_dropout=0.6), np.random.default_rng(seed))
+        assert np.array_equal(after.boxes, frame.boxes)
+        assert np.array_equal(after.points, points[np.isin(points[:, 3], after.points[:, 3])])
         shares.append(1 - len(after.points) / 4000)
     # 0.6 / sqrt(12) = 0.17 is the spread of the draw; 60 draws tell the mean to 0.022.
     assert min(shares) < 0.1 and 0.5 < max(shares) < 0.63 and np.mean(shares) == pytest.approx(0.3, abs=0.08)
@@ -295,6 +260,118 @@ def test_the_share_of_dropped_points_is_itself_drawn() -> None:
 @pytest.mark.parametrize(("points", "boxes"), [(0, 0), (0, 2), (5, 0)])
 def test_empty_frames(points: int, boxes: int) -> None:
     cloud, array, _ = make_scene(3)
-    frame = LabeledFrame("0", cloud[:points], array[:boxes], np.zeros(boxes, np.int64))
-    after = augment(frame, replace(STRONG, point_dropout=0.3, flip_probability=1), np.random.default_rng(0))
+    strong = replace(STRONG, point_dropout=0.3, flip_probability=1)
+    after = augment(frame_of(array[:boxes], cloud[:points]), strong, np.random.default_rng(0))
     assert after.points.shape[1:] == (4,) and len(after.points) <= points and after.boxes.shape == (boxes, 7)
+
+
+# --- corruption: of the points of objects only, within what was asked for
+
+
+POINTS, BOXES, _ = make_scene(3)
+INSIDE = points_in_boxes(POINTS, BOXES)
+
+
+def corrupting(**changes: object) -> AugmentConfig:
+    return dataclasses.replace(AugmentConfig(), **changes)  # type: ignore[arg-type]
+
+
+def corrupted(seed: int, points: NDArray[np.float32] = POINTS, **changes: object) -> NDArray[np.float32]:
+    return corrupt_objects(points, BOXES, corrupting(**changes), np.random.default_rng(seed))
+
+
+def test_off_draws_nothing() -> None:
+    rng = np.random.default_rng(0)
+    assert corrupt_objects(POINTS, BOXES, AugmentConfig(), rng) is POINTS
+    points = POINTS.copy()
+    drop_reflectance(points, AugmentConfig(), rng)
+    assert np.array_equal(points, POINTS)
+    assert rng.bit_generator.state == np.random.default_rng(0).bit_generator.state
+
+
+def test_each_object_has_one_gain_of_its_own() -> None:
+    before = POINTS.copy()
+    found = corrupted(1, object_reflectance_gain=(0.5, 2.0))
+    assert np.array_equal(POINTS, before) and np.array_equal(found[:, :3], POINTS[:, :3])
+    assert np.array_equal(found[~INSIDE.any(axis=1)], POINTS[~INSIDE.any(axis=1)])
+    gains = []
+    for own in INSIDE.T:
+        dark = own & (POINTS[:, 3] < 0.45)  # twice as much is not cut off at 1
+        ratio = found[dark, 3] / POINTS[dark, 3]
+        assert np.ptp(ratio) < 1e-5 and 0.5 <= ratio[0] <= 2
+        gains.append(ratio[0])
+    assert len(set(np.round(gains, 4))) == len(BOXES) and found[:, 3].max() <= 1
+
+
+def test_gains_halve_as_often_as_they_double() -> None:
+    dark = POINTS.copy()
+    dark[:, 3] = 0.1
+    gains = [corrupted(s, dark, object_reflectance_gain=(0.5, 2.0))[INSIDE[:, 0], 3][0] / 0.1 for s in range(300)]
+    assert np.mean(np.array(gains) > 1) == pytest.approx(0.5, abs=0.1)
+
+
+def test_jitter_has_its_standard_deviation() -> None:
+    found = corrupted(2, object_jitter_m=0.015)
+    moved = INSIDE.any(axis=1)
+    assert np.array_equal(found[~moved], POINTS[~moved]) and np.array_equal(found[:, 3], POINTS[:, 3])
+    difference = (found - POINTS)[moved, :3]
+    assert difference.std() == pytest.approx(0.015, rel=0.1) and abs(difference.mean()) < 0.002
+
+
+def test_a_cut_takes_a_sector_or_rings_as_seen_from_the_sensor() -> None:
+    taken = {"azimuth": 0, "elevation": 0}
+    for seed in range(40):
+        found = corrupted(seed, object_cut_probability=1.0)
+        gone = ~np.isin(POINTS.view("V16").ravel(), np.ascontiguousarray(found).view("V16").ravel())
+        assert not gone[~INSIDE.any(axis=1)].any()
+        for own in INSIDE.T:
+            if not gone[own].any():
+                continue
+            x, y, z, _ = POINTS[own].astype(np.float64).T
+            angles = {"azimuth": np.arctan2(y, x), "elevation": np.arctan2(z, np.hypot(x, y))}
+            cut = gone[own]
+            assert (~cut).sum() >= FEWEST_POINTS
+            # Nothing that stays lies inside the range of what is gone, in one of the two angles.
+            clean = {
+                name: not ((angle > angle[cut].min()) & (angle < angle[cut].max()))[~cut].any()
+                for name, angle in angles.items()
+            }
+            assert any(clean.values())
+            for name in taken:
+                taken[name] += clean[name]
+    assert min(taken.values()) > 20
+
+
+def test_an_object_of_few_points_is_not_cut() -> None:
+    few = np.concatenate([POINTS[INSIDE[:, 0]][:FEWEST_POINTS], POINTS[~INSIDE.any(axis=1)]])
+    for seed in range(20):
+        assert len(corrupted(seed, few, object_cut_probability=1.0)) == len(few)
+    nothing = corrupted(0, np.empty((0, 4), np.float32), object_cut_probability=1.0, object_jitter_m=0.1)
+    assert nothing.shape == (0, 4)
+
+
+def test_reflectance_is_lost_in_part_or_is_one_value() -> None:
+    some = constant = same = 0
+    bright = POINTS.copy()
+    bright[:, 3] = np.linspace(0.2, 0.9, len(bright))
+    for seed in range(200):
+        points = bright.copy()
+        drop_reflectance(points, corrupting(reflectance_loss_probability=0.5), np.random.default_rng(seed))
+        assert np.array_equal(points[:, :3], bright[:, :3])
+        same += np.array_equal(points, bright)
+        constant += np.ptp(points[:, 3]) == 0
+        some += bool((points[:, 3] == 0).any() and np.isin(points[:, 3], [0, *bright[:, 3]]).all())
+    assert same == pytest.approx(100, abs=25) and constant == pytest.approx(50, abs=20)
+    assert some == pytest.approx(50, abs=20)
+
+
+def test_a_cut_is_that_of_the_sensor_wherever_the_origin_is() -> None:
+    """Points of a vehicle's frame, whose sensor stands on its roof, lose what those of the sensor's own frame lose."""
+    cut, sensor_m = corrupting(object_cut_probability=1.0), (1.5, 0.25, 2.0)
+    boxes = BOXES + np.array([0, 0, 0, 0.02, 0.02, 0.02, 0], np.float32)  # no point on a face
+    lifted = POINTS + np.array([*sensor_m, 0], np.float32), boxes + np.array([*sensor_m, 0, 0, 0, 0], np.float32)
+    for seed in range(6):
+        own = corrupt_objects(POINTS, boxes, cut, np.random.default_rng(seed))
+        found = corrupt_objects(*lifted, cut, np.random.default_rng(seed), sensor_m)
+        from_the_origin = corrupt_objects(*lifted, cut, np.random.default_rng(seed))
+        assert abs(len(found) - len(own)) <= 1 < abs(len(from_the_origin) - len(own))

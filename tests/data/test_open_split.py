@@ -15,14 +15,15 @@ from tests.helpers.scenes import write_dataset
 
 def test_kitti(tmp_path: Path) -> None:
     split = KittiSplit(write_dataset(tmp_path / "kitti", 1))
-    boxes = labels_of_scan(split.scan_path("000000"))
+    scan, label = split.scan_path("000000"), split.label_path("000000")
+    boxes = labels_of_scan(scan)
     assert boxes is not None and len(boxes)
     np.testing.assert_array_equal(boxes, split.labeled_boxes("000000").boxes)
-    split.label_path("000000").write_text("damaged")
+    label.write_text("damaged")
     with pytest.raises(DatasetError, match=r"000000\.txt:1"):
-        labels_of_scan(split.scan_path("000000"))
-    split.label_path("000000").unlink()
-    assert labels_of_scan(split.scan_path("000000")) is None
+        labels_of_scan(scan)
+    label.unlink()
+    assert labels_of_scan(scan) is labels_of_scan(tmp_path / "scan.bin") is None
 
 
 def test_boxes_are_in_the_frame_of_the_scan(tmp_path: Path) -> None:
@@ -35,7 +36,3 @@ def test_boxes_are_in_the_frame_of_the_scan(tmp_path: Path) -> None:
     np.testing.assert_allclose(boxes, box, atol=1e-4)
     assert labels_of_scan(root / "scans" / "000001.bin") is None  # without a line
     assert labels_of_scan(tmp_path / "own" / "elsewhere.bin") is None  # not one of its scans
-
-
-def test_none(tmp_path: Path) -> None:
-    assert labels_of_scan(tmp_path / "scan.bin") is None

@@ -22,6 +22,7 @@ def test_footprints_by_hand() -> None:
     np.testing.assert_allclose(first, [[12, 3], [8, 3], [8, 1], [12, 1]], atol=1e-12)
     # Heading left, the front is at high y, and the box's left side faces backwards.
     np.testing.assert_allclose(second, [[9, 4], [9, 0], [11, 0], [11, 4]], atol=1e-12)
+    assert first.dtype == corners(np.array([FORWARD])).dtype == np.float64
 
 
 def test_footprints_run_counter_clockwise() -> None:
@@ -42,10 +43,6 @@ def test_corners_stack_the_footprint() -> None:
     np.testing.assert_array_equal(stacked[:, 4:, :2], footprints(boxes))
     np.testing.assert_allclose(stacked[:, :4, 2], np.repeat(boxes[:, 2:3] - boxes[:, 5:6] / 2, 4, axis=1))
     np.testing.assert_allclose(stacked[:, 4:, 2], np.repeat(boxes[:, 2:3] + boxes[:, 5:6] / 2, 4, axis=1))
-
-
-def test_float64_stays_float64() -> None:
-    assert footprints(np.array([FORWARD])).dtype == corners(np.array([FORWARD])).dtype == np.float64
 
 
 @pytest.mark.parametrize(
@@ -105,6 +102,8 @@ def test_wrapped_angles_differ_by_whole_periods(angle: float, period: float, dty
     if -period / 2 <= float(angle) < period / 2:
         assert wrapped == angle
     assert wrap_angle(wrapped, period) == wrapped
+    for shape in ((1, 2), (0, 3)):
+        assert np.array_equal(wrap_angle(np.full(shape, angle), period), np.full(shape, wrapped))
 
 
 @pytest.mark.parametrize("angle", [-math.pi, math.pi, 3 * math.pi, np.nextafter(-math.pi, -4), -1e-20, 0.0])
@@ -113,8 +112,3 @@ def test_wrapping_at_the_border(angle: float) -> None:
         wrapped = float(wrap_angle(value))
         assert -math.pi <= wrapped < math.pi
         assert abs(math.sin(wrapped) - math.sin(angle)) < 1e-6 and abs(math.cos(wrapped) - math.cos(angle)) < 1e-6
-
-
-def test_wrapping_keeps_the_shape() -> None:
-    np.testing.assert_allclose(wrap_angle([[4.0, -4.0]]), [[4 - 2 * math.pi, 2 * math.pi - 4]])
-    assert wrap_angle(np.empty((0, 3), np.float32)).shape == (0, 3)

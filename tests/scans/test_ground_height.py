@@ -13,29 +13,7 @@ from asca_pillars.scans.ground_height import (
     fit_ground_plane,
     measured_mounting,
 )
-from asca_pillars.scans.input_check import ground_z_m
 from asca_pillars.scans.mounting import Mounting
-
-
-def street(count: int = 4000) -> NDArray[np.float32]:
-    """Flat ground at z = -1.7 with a wall along one side."""
-    rng = np.random.default_rng(4)
-    points = rng.uniform((0, -7.6, -1.75, 0.1), (23, 10.2, -1.65, 0.5), (count, 4))
-    points[: count // 3, 1:3] = rng.uniform((9.5, -1.7), (10, 1.3), (count // 3, 2))
-    return points.astype(np.float32)
-
-
-def test_the_ground_is_not_a_reflection_below_it_nor_the_vehicles_roof() -> None:
-    points = street()
-    points[:80, 2] = -9.0  # 2 % ghosts under the road
-    roof = np.tile(np.array([[0.5, 0.2, -0.4, 0.3]], np.float32), (60_000, 1))
-    assert ground_z_m(np.concatenate([points, roof])) == pytest.approx(-1.7, abs=0.1)
-
-
-def test_too_few_points_near_the_sensor() -> None:
-    assert ground_z_m(street(40)) is None
-    assert ground_z_m(street()[:0]) is None
-    assert ground_z_m(street() + np.array([100, 0, 0, 0], np.float32)) is None
 
 
 def sloped(height: float, tilt_deg: float = 0.0, seed: int = 0, noise_m: float = 0.02) -> NDArray[np.float32]:
@@ -88,38 +66,36 @@ def test_the_height_is_estimated_along_the_axes() -> None:
     ("scans", "message"),
     [
         ([], "without a scan"),
-        ([sloped(1.7)[:100]], "scan 1: too few points"),
-        ([sloped(1.7, tilt_deg=9)], "tilted by 9 degrees"),
-        ([sloped(1.7, noise_m=2.0)], "of the low points"),
         ([sloped(1.7), sloped(1.2)], r"2 scans disagree by 0\.50 m .*: 1\.2. m in scan 2, 1\.7. m in scan 1;"),
         ([sloped(1.7)[:100], sloped(1.7, tilt_deg=9)], r"from scan 1: too few points .* \(and 1 more\)"),
     ],
 )
 def test_an_unsure_height_is_refused(scans: list[NDArray[np.float32]], message: str) -> None:
-    with pytest.raises(ScanError, match=message) as error:
+    with pytest.raises(ScanError, match=f"{message}.*--sensor-height"):
         estimate_height(scans)
-    assert "--sensor-height" in str(error.value)
 
 
-NO_GROUND = {
-    "too few points": sloped(1.7)[:100],
-    "tilted by 9 degrees": sloped(1.7, tilt_deg=9),
-    "of the low points": sloped(1.7, noise_m=2.0),
-}
-
-
-@pytest.mark.parametrize("why", NO_GROUND)
-@pytest.mark.parametrize("place", [0, 1, 2])
-def test_a_scan_without_ground_is_left_out_and_named(why: str, place: int) -> None:
-    scans = [NamedPoints(f"{number}.bin", sloped(1.7, seed=number)) for number in range(2)]
-    scans.insert(place, NamedPoints("garage.bin", NO_GROUND[why]))
-    estimate = estimate_named_height(scans)
-    assert estimate.height_m == pytest.approx(1.7, abs=0.03) and estimate.scans == 2
-    (left_out,) = estimate.left_out
-    assert left_out.startswith("garage.bin: ") and why in left_out
-    assert f"from 2 scans, which agree within {estimate.spread_m:.2f} m" in str(estimate)
-    assert str(estimate).endswith(f"; left out: {left_out}")
-    assert estimate_height([points for _, points in scans]).left_out[0].startswith(f"scan {place + 1}: ")
+@pytest.mark.parametrize(
+    ("garage", "why"),
+    [
+        (sloped(1.7)[:100], "too few points"),
+        (sloped(1.7, tilt_deg=9), "tilted by 9 degrees"),
+        (sloped(1.7, noise_m=2.0), "of the low points"),
+    ],
+)
+def test_a_scan_without_ground_is_left_out_and_named(garage: NDArray[np.float32], why: str) -> None:
+    with pytest.raises(ScanError, match=f"from scan 1: .*{why}"):
+        estimate_height([garage])
+    for place in range(3):
+        scans = [NamedPoints(f"{number}.bin", sloped(1.7, seed=number)) for number in range(2)]
+        scans.insert(place, NamedPoints("garage.bin", garage))
+        estimate = estimate_named_height(scans)
+        assert estimate.height_m == pytest.approx(1.7, abs=0.03) and estimate.scans == 2
+        (left_out,) = estimate.left_out
+        assert left_out.startswith("garage.bin: ") and why in left_out
+        assert f"from 2 scans, which agree within {estimate.spread_m:.2f} m" in str(estimate)
+        assert str(estimate).endswith(f"; left out: {left_out}")
+        assert estimate_height([points for _, points in scans]).left_out[0].startswith(f"scan {place + 1}: ")
 
 
 def test_no_more_scans_are_read_than_needed() -> None:

@@ -53,10 +53,16 @@ def test_without_a_height_nothing_is_lifted() -> None:
     assert Mounting(sensor_height_m=1.2).to_model(None).is_identity  # nobody knows how high the model's was
 
 
-def test_a_pose_lifts_and_turns() -> None:
+def test_a_pose_lifts_and_turns_and_may_be_an_array() -> None:
     pose = ((0.0, 1.0, 0.0, 2.0), (-1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 1.0, 1.84), (0.0, 0.0, 0.0, 1.0))
-    change = Mounting(sensor_height_m=0.0, pose=pose).to_model(1.73)
-    np.testing.assert_allclose(change.points(POINT)[0, :3], [5 + 2, -3, -1 + 1.84 - 1.73], atol=1e-6)
+    mounting = Mounting(sensor_height_m=0.0, pose=np.array(pose))  # type: ignore[arg-type]  # what NumPy's users have
+    np.testing.assert_allclose(mounting.level.points(POINT)[0, :3], [5 + 2, -3, -1 + 1.84], atol=1e-6)
+    np.testing.assert_allclose(mounting.to_model(1.73).points(POINT)[0, :3], [5 + 2, -3, -1 + 1.84 - 1.73], atol=1e-6)
+    assert mounting == Mounting(sensor_height_m=0.0, pose=pose) and hash(mounting)
+
+
+def rows(*diagonal: float) -> tuple[tuple[float, ...], ...]:
+    return tuple(map(tuple, np.diag(diagonal).tolist()))
 
 
 @pytest.mark.parametrize(
@@ -66,28 +72,21 @@ def test_a_pose_lifts_and_turns() -> None:
         ({"axes": "x,x,z"}, "give x-forward"),
         ({"axes": "--x,y,z"}, "give x-forward"),
         ({"axes": "z,-x,-y"}, "z axis, which must point up or down"),
+        ({"axes": None}, "axes None: give"),
         ({"sensor_height_m": float("nan")}, "sensor height nan"),
         ({"sensor_height_m": 40.0}, "at most 10"),
         ({"sensor_height_m": "auto"}, r"sensor height 'auto': give metres; .measured_mounting"),
-        ({"axes": None}, "axes None: give"),
         ({"pose": "pose.txt"}, r"pose 'pose.txt': give a 4x4 matrix; .read_pose"),
         ({"pose": np.eye(3)}, r"pose of shape \(3, 3\): give a 4x4 matrix"),
         ({"pose": np.eye(4).ravel()}, r"pose of shape \(16,\)"),
-        ({"pose": ((1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 2, 0), (0, 0, 0, 1))}, "a rotation and a shift"),
-        ({"pose": ((1, 0, 0, 0), (0, -1, 0, 0), (0, 0, 1, 0), (0, 0, 0, 1))}, "a rotation and a shift"),
-        ({"pose": tuple(map(tuple, np.eye(4))), "axes": "y-forward"}, "give one of them"),
+        ({"pose": rows(1, 1, 2, 1)}, "a rotation and a shift"),
+        ({"pose": rows(1, -1, 1, 1)}, "a rotation and a shift"),
+        ({"pose": rows(1, 1, 1, 1), "axes": "y-forward"}, "give one of them"),
     ],
 )
 def test_what_cannot_be_is_refused(settings: dict, message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         Mounting(**settings)
-
-
-def test_a_pose_may_be_an_array() -> None:
-    turned = np.array([[0, 1, 0, 2], [-1, 0, 0, 0], [0, 0, 1, 1.84], [0, 0, 0, 1]])
-    mounting = Mounting(pose=turned)  # type: ignore[arg-type]  # what NumPy's users have at hand
-    assert mounting == Mounting(pose=turned.tolist()) and hash(mounting)
-    np.testing.assert_allclose(mounting.level.points(POINT)[0, :3], [5 + 2, -3, -1 + 1.84], atol=1e-6)
 
 
 def test_from_a_config_and_back() -> None:
@@ -101,15 +100,11 @@ def test_a_pose_file(tmp_path: Path) -> None:
     path = tmp_path / "pose.txt"
     np.savetxt(path, np.eye(4))
     assert Mounting(pose=read_pose(path)).level.is_identity
-    path.write_text("1 0 0")
-    with pytest.raises(ConfigError, match="holds 3 numbers"):
-        read_pose(path)
-    path.write_text("one")
-    with pytest.raises(ConfigError, match="16 numbers"):
-        read_pose(path)
-    for scale in (2, 1e200, np.inf, np.nan):
-        np.savetxt(path, np.diag([scale, scale, scale, 1]))
-        with pytest.raises(ConfigError, match=r"pose\.txt: must be a rotation and a shift, without a scale"):
+    scaled = [" ".join(map(str, np.diag([scale] * 3 + [1]).ravel())) for scale in (2, 1e200, np.inf, np.nan)]
+    rotation = r"pose\.txt: must be a rotation and a shift, without a scale"
+    for text, message in (("1 0 0", "holds 3 numbers"), ("one", "16 numbers"), *((text, rotation) for text in scaled)):
+        path.write_text(text)
+        with pytest.raises(ConfigError, match=message):
             read_pose(path)
     with pytest.raises(ConfigError, match=r"none\.txt"):
         read_pose(tmp_path / "none.txt")

@@ -8,7 +8,7 @@ v2/perception.
 
 import math
 from collections import Counter, defaultdict
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,13 +16,14 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.progress import track
 
-from asca_pillars.base.errors import DatasetError
+from asca_pillars.base.errors import AscaError, DatasetError
 from asca_pillars.base.files import atomic_path, portable_name, write_text
+from asca_pillars.base.input_files import require_content
+from asca_pillars.base.installation import install_command
 from asca_pillars.data.boxes.box_records import BoxRecords, records_from
 from asca_pillars.data.boxes.box_split import DATASET_FILE, BoxDataset
 from asca_pillars.data.importing.foreign_values import SkippedEntries, numbers, text_of, whole_number
 from asca_pillars.data.importing.imported import MARKER, Imported, ImportedFrame, require_own_dataset
-from asca_pillars.data.importing.parquet_rows import parquet_rows
 from asca_pillars.data.importing.waymo_range_image import Doubles, LidarCalibration, range_image_points
 from asca_pillars.geometry.frame_change import is_rigid
 from asca_pillars.scans.find_scans import visible_files
@@ -41,6 +42,7 @@ _INCLINATION = "[LiDARCalibrationComponent].beam_inclination"
 _IMAGES = tuple(f"[LiDARComponent].range_image_return{number}" for number in (1, 2))
 _PIXEL_POSE = "[LiDARPoseComponent].range_image_return1"
 _VEHICLE_POSE = "[VehiclePoseComponent].world_from_vehicle.transform"
+_BATCH = 8  # rows in memory at once: a range image has millions of numbers
 
 
 def read_waymo(root: Path, out: Path) -> Imported:
@@ -93,7 +95,7 @@ def _write_scans(root: Path, lidar: Path, folder: Path, left_out: SkippedEntries
     early: dict[int, NDArray[np.float32]] = {}
     points: dict[int, list[NDArray[np.float32]]] = defaultdict(list)
     columns = (_TIME, _LASER, *(f"{image}.{part}" for image in _IMAGES for part in ("values", "shape")))
-    for number, row in enumerate(parquet_rows(lidar, columns)):
+    for number, row in enumerate(_parquet_rows(lidar, columns)):
         time = row[_TIME]
         if not isinstance(time, int) or time not in missing:
             continue
@@ -119,7 +121,7 @@ def _write_scans(root: Path, lidar: Path, folder: Path, left_out: SkippedEntries
 def _images_of_times(lidar: Path, left_out: SkippedEntries) -> Counter[int]:
     """Return the number of rows, one for each sensor, of each frame of a segment."""
     rows: Counter[int] = Counter()
-    for number, row in enumerate(parquet_rows(lidar, (_TIME,))):
+    for number, row in enumerate(_parquet_rows(lidar, (_TIME,))):
         try:
             rows[whole_number(row[_TIME], _TIME)] += 1
         except ValueError as reason:
@@ -150,7 +152,7 @@ def _labels(path: Path, left_out: SkippedEntries) -> dict[int, BoxRecords]:
     boxes: dict[int, list[NDArray[np.float64]]] = defaultdict(list)
     types: dict[int, list[str]] = defaultdict(list)
     objects: dict[int, list[str | None]] = defaultdict(list)
-    for number, row in enumerate(parquet_rows(path, (_TIME, _OBJECT, f"{_BOX}.type", *_BOX_COLUMNS))):
+    for number, row in enumerate(_parquet_rows(path, (_TIME, _OBJECT, f"{_BOX}.type", *_BOX_COLUMNS))):
         try:
             time = whole_number(row[_TIME], _TIME)
             kind = whole_number(row[f"{_BOX}.type"], f"{_BOX}.type")
@@ -169,7 +171,7 @@ def _calibrations(path: Path, left_out: SkippedEntries) -> dict[int, LidarCalibr
     """Read the calibration of each sensor, by its number."""
     columns = (_LASER, _EXTRINSIC, *(f"{_INCLINATION}.{part}" for part in ("values", "min", "max")))
     found = {}
-    for number, row in enumerate(parquet_rows(path, columns)):
+    for number, row in enumerate(_parquet_rows(path, columns)):
         try:
             stated = row[f"{_INCLINATION}.values"]
             given = isinstance(stated, np.ndarray) and len(stated) > 0
@@ -197,7 +199,7 @@ def _rigid(values: Any, name: str) -> Doubles:
 def _vehicle_poses(path: Path, left_out: SkippedEntries) -> dict[int, Doubles]:
     """Read the transform (4, 4) of each frame from the vehicle to the world; empty if it was not downloaded."""
     poses: dict[int, Doubles] = {}
-    for number, row in enumerate(parquet_rows(path, (_TIME, _VEHICLE_POSE)) if path.is_file() else ()):
+    for number, row in enumerate(_parquet_rows(path, (_TIME, _VEHICLE_POSE)) if path.is_file() else ()):
         try:
             poses[whole_number(row[_TIME], _TIME)] = _rigid(row[_VEHICLE_POSE], _VEHICLE_POSE)
         except ValueError as reason:
@@ -208,7 +210,7 @@ def _vehicle_poses(path: Path, left_out: SkippedEntries) -> dict[int, Doubles]:
 def _pixel_poses(path: Path, left_out: SkippedEntries) -> Iterator[tuple[int, NDArray[np.float32]]]:
     """Yield time and poses (H, W, 6) of each frame, of the sensor that has them; nothing if not downloaded."""
     columns = (_TIME, _LASER, f"{_PIXEL_POSE}.values", f"{_PIXEL_POSE}.shape")
-    for number, row in enumerate(parquet_rows(path, columns) if path.is_file() else ()):
+    for number, row in enumerate(_parquet_rows(path, columns) if path.is_file() else ()):
         try:
             image = _image(row, _PIXEL_POSE) if _is_top(row) else None
             if image is not None:
@@ -235,3 +237,39 @@ def _image(row: dict[str, Any], name: str) -> NDArray[np.float32] | None:
     if min(sizes) <= 0 or math.prod(sizes) != len(values):
         raise ValueError(f"{name} has {len(values)} values for the shape {sizes}")
     return values.astype(np.float32).reshape(sizes)
+
+
+def _parquet_rows(path: Path, columns: Sequence[str]) -> Iterator[dict[str, Any]]:
+    """Yield the rows of a file by column: numbers and texts unchanged, lists as NumPy arrays, missing values as None.
+
+    None also stands for a value that Python cannot represent, such as a date in the year 300,000.
+
+    Raises:
+        DatasetError: not a parquet file, or one without these columns.
+        AscaError: pyarrow is not installed.
+    """
+    try:
+        import pyarrow
+        from pyarrow import parquet
+    except ModuleNotFoundError:
+        raise AscaError(f"{path}: pyarrow not installed: {install_command('import')}") from None
+    try:
+        require_content(path, DatasetError)
+        with parquet.ParquetFile(path) as file:
+            names = file.schema_arrow.names
+            if missing := [name for name in columns if name not in names]:
+                raise DatasetError(f"{path}: no column `{missing[0]}`; give a file of Waymo's parquet form")
+            for batch in file.iter_batches(_BATCH, columns=list(columns)):
+                for row in range(batch.num_rows):
+                    yield {name: _plain(batch.column(name)[row]) for name in columns}
+    except (pyarrow.ArrowException, OSError, KeyError) as reason:  # KeyError: two columns of one name
+        text = " ".join(str(reason).split())[:100]
+        raise DatasetError(f"{path}: no readable parquet file ({text}); copy it again") from None
+
+
+def _plain(value: Any) -> Any:
+    items: Any = getattr(value, "values", None)  # of a list; None for a null list
+    try:
+        return value.as_py() if not hasattr(items, "to_numpy") else items.to_numpy(zero_copy_only=False)
+    except (ValueError, TypeError, LookupError, OverflowError, NotImplementedError):  # includes Arrow's own
+        return None

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import yaml
 
-from asca_pillars.base.errors import ConfigError
+from asca_pillars.base.errors import ConfigError, DatasetError
 from asca_pillars.base.schema import to_dict
 from asca_pillars.cli.prepare import prepare
 from asca_pillars.config.pillar import PillarModel
@@ -16,7 +16,7 @@ from asca_pillars.data.boxes.box_records import json_line, read_frames, records_
 from asca_pillars.data.boxes.box_split import BoxSplit
 from asca_pillars.data.frames import read_frame
 from asca_pillars.data.insertion.insert_objects import insert_objects, prepare_inserter
-from asca_pillars.data.inspection.findings import findings
+from asca_pillars.data.inspection.findings import Finding, findings
 from asca_pillars.data.inspection.inspect_dataset import inspect_dataset
 from asca_pillars.data.kitti import KittiSplit
 from asca_pillars.data.open_split import open_split
@@ -29,6 +29,11 @@ from tests.helpers.scenes import SPEC, make_scene, write_dataset
 
 CLASSES = (SPEC.classes[0], ClassSpec("Forklift", 0.8, 0.6, 1.73, -0.87, 0.35, 0.2))
 CONFIG = Config(model=PillarModel(spec=replace(SPEC, classes=CLASSES)), data=DataConfig(workers=0))
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    return write_box_dataset(tmp_path / "own", 4)
 
 
 def test_the_layout_tells_the_reader(root: Path, tmp_path: Path) -> None:
@@ -111,8 +116,7 @@ def test_inspection_and_insertion_read_it(root: Path) -> None:
     assert not [finding for finding in findings(inspection, spec, 1) if finding.level == "error"]
     inserter = prepare_inserter(split, spec, CONFIG.data, InsertConfig("gt_aug", objects=4))
     frame = read_frame(split, "000000", spec.class_names)
-    grown = insert_objects(frame, inserter, np.random.default_rng(0))
-    assert len(grown.boxes) > len(frame.boxes)
+    assert len(insert_objects(frame, inserter, np.random.default_rng(0)).boxes) > len(frame.boxes)
     assert inserter.free_space("000000").free.any()
 
 
@@ -122,8 +126,8 @@ def test_prepare_makes_the_maps_that_training_reads(
     """Without a camera nothing is cut to its view, whatever `data.camera_view` is by default."""
     (tmp_path / "own.yaml").write_text(yaml.safe_dump(to_dict(CONFIG)))
     prepare(tmp_path / "own.yaml", data=root, workers=1)
-    monkeypatch.setattr("asca_pillars.data.insertion.free_space.find_free_space", lambda _: pytest.fail("again"))
-    monkeypatch.setattr("asca_pillars.data.insertion.gt_database._build", lambda *_: pytest.fail("built again"))
+    for name in ("free_space.find_free_space", "gt_database._build"):
+        monkeypatch.setattr(f"asca_pillars.data.insertion.{name}", lambda *_: pytest.fail("again"))
     insert = replace(CONFIG.augment, insert=InsertConfig("rs_aug", objects=4))
     inserter = open_frames(root, replace(CONFIG, augment=insert), training=True).inserter
     assert inserter is not None and all(inserter.free_space(name).free.any() for name in inserter.split.frame_ids)
@@ -132,28 +136,99 @@ def test_prepare_makes_the_maps_that_training_reads(
 def test_inspection_notices_axes_that_lie_otherwise(root: Path) -> None:
     """The scenes are ahead of the sensor only: with x to the right they stand to the left."""
     spec = pillar_spec(CONFIG)
-    right = findings(inspect_dataset(open_split(root), spec, CONFIG.data), spec, 1)
-    assert not [finding for finding in right if finding.about == "axes"]
-    level = Mounting(axes="y-forward").level
+
+    def found() -> list[Finding]:
+        return findings(inspect_dataset(open_split(root), spec, CONFIG.data), spec, 1)
+
+    right, back = found(), Mounting(axes="y-forward").level.inverse
     for path in (root / "scans").iterdir():
-        write_scan(path, level.inverse.points(read_scan(path).points))
-    turned = [
-        json_line(scan, records_from(level.inverse.boxes(records.boxes), records.types))
-        for scan, records, *_ in list(read_frames(root / "labels.jsonl"))
-    ]
+        write_scan(path, back.points(read_scan(path).points))
+    frames = list(read_frames(root / "labels.jsonl"))
+    turned = [json_line(scan, records_from(back.boxes(own.boxes), own.types)) for scan, own, *_ in frames]
     (root / "labels.jsonl").write_text("".join(turned))
-    wrong = findings(inspect_dataset(open_split(root), spec, CONFIG.data), spec, 1)
-    (text,) = [finding.text for finding in wrong if finding.about == "axes"]
+    (text,) = [finding.text for finding in found() if finding.about == "axes"]
     assert "state the axes, `axes: y,-x,z` in dataset.yaml" in text
     (root / "dataset.yaml").write_text("axes: y,-x,z\n")
-    mended = findings(inspect_dataset(open_split(root), spec, CONFIG.data), spec, 1)
-    assert [finding.about for finding in mended] == [finding.about for finding in right]
+    assert [finding.about for finding in found()] == [finding.about for finding in right]
 
 
-def test_labels_all_around_leave_nothing_out(tmp_path: Path) -> None:
+def test_labels_all_around_leave_nothing_out(root: Path) -> None:
     """Straight behind: rounded to float32, half a turn is more than half a turn."""
-    split = BoxSplit(write_box_dataset(tmp_path / "own", 2))
-    behind = np.array([[-5, 0, 0, 0.1]], np.float32)
+    split, behind = BoxSplit(root), np.array([[-5, 0, 0, 0.1]], np.float32)
     assert split.in_labeled_view("000000", behind).all()
     write_scan(split.scan_path("000000"), behind)
     assert len(split.points("000000", camera_view=True)) == 1
+
+
+# --- which scans are frames, and what is said of labels without one
+
+
+def frame_ids(root: Path, settings: str | None = None, name: str = "training") -> tuple[str, ...]:
+    if settings is not None:
+        (root / "dataset.yaml").write_text(settings)
+    return BoxSplit(root, name).frame_ids
+
+
+def test_a_file_for_each_frame_gives_the_same(root: Path) -> None:
+    expected = [BoxSplit(root).labeled_boxes(frame_id).boxes for frame_id in frame_ids(root)]
+    (root / "labels").mkdir()
+    for number, line in enumerate((root / "labels.jsonl").read_text().splitlines()):
+        (root / "labels" / f"{number:06d}.json").write_text(line)
+    (root / "labels.jsonl").unlink()
+    assert frame_ids(root, "labels: labels\n") == tuple(f"{number:06d}" for number in range(4))
+    np.testing.assert_array_equal([BoxSplit(root).labeled_boxes(name).boxes for name in frame_ids(root)], expected)
+
+
+def test_with_a_csv_scans_without_a_row_are_frames_without_objects(root: Path) -> None:
+    (root / "labels.csv").write_text("scan,class,x,y,z,length,width,height,yaw\n000002.bin,Car,10,0,-1,4,2,1.5,0\n")
+    names = frame_ids(root, "labels: labels.csv\n", "train")
+    assert [len(BoxSplit(root).labeled_boxes(frame_id).boxes) for frame_id in names] == [0, 0, 1]
+    with pytest.raises(DatasetError, match=r"000000\.bin: no such folder"):
+        frame_ids(root, "labels: labels.csv\nscans: scans/000000.bin\n")
+    np.save(root / "scans" / "000001.npy", np.zeros((5, 4), np.float32))
+    with pytest.raises(DatasetError, match=r"000001\.bin and .*000001\.npy: both would be frame 000001; rename one"):
+        frame_ids(root, "labels: labels.csv\n")
+
+
+def test_scans_may_lie_anywhere_and_in_folders(root: Path, tmp_path: Path) -> None:
+    labels = root / "labels.jsonl"
+    text = labels.read_text()
+    labels.write_text(text.replace('"scan": "', f'"scan": "{root}/scans/'))
+    assert len(frame_ids(root)) == 4
+    (tmp_path / "drive").mkdir()
+    (root / "scans").rename(tmp_path / "drive" / "a")
+    labels.write_text(text.replace('"scan": "', '"scan": "a/'))
+    assert frame_ids(root, f"scans: {tmp_path / 'drive'}\n")[0] == "a/000000"
+    assert len(BoxSplit(root).points("a/000000")) > 1000
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ('{"scan": "9.bin", "boxes": []}', r"labels\.jsonl:1: no scan 9\.bin below .*correct the name"),
+        ('{"scan": "../000000.bin", "boxes": []}', r"labels\.jsonl:1: no scan"),
+        (f'{{"scan": "{"a/" * 200_000}x.bin", "boxes": []}}', r"labels\.jsonl:1: no scan"),
+        ('{"scan": "000000.bin", "boxes": []}\n' * 2, r"labels\.jsonl:2: 000000\.bin has labels in .*jsonl:1 already"),
+        ("", r"labels\.jsonl: no frame in it"),
+        ('{"scan": "000000.bin", "boxes": []}', r"000001: listed in ImageSets/train\.txt, but .* has no such frame"),
+    ],
+    ids=range(6),
+)
+def test_wrong_labels_are_named(root: Path, text: str, message: str) -> None:
+    (root / "labels.jsonl").write_text(text)
+    with pytest.raises(DatasetError, match=message):
+        frame_ids(root, name="train")
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        ("9.json", '{"boxes": []}', r"9\.json: belongs to one scan .* there is none"),
+        ("000000.txt", "10.0 1.0 -1.0 4.1 1.7 1.5 1.2 Car\n", r"000000\.txt is text: .*--from openpcdet"),
+    ],
+)
+def test_a_wrong_file_of_labels_is_named(root: Path, name: str, text: str, message: str) -> None:
+    (root / "labels").mkdir()
+    (root / "labels" / name).write_text(text)
+    with pytest.raises(DatasetError, match=message):
+        frame_ids(root, "labels: labels\n")

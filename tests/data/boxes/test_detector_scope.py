@@ -29,16 +29,11 @@ def test_the_lowest_end_is_inside_and_the_highest_is_not() -> None:
 @pytest.mark.parametrize(
     "content",
     [
-        None,
-        "PointPillars",
-        {"name": "PointPillars"},
-        {"classes": ["Car"]},
-        {"ranges_m": None},
+        *(None, "PointPillars", {"name": "PointPillars"}, {"classes": ["Car"]}, {"ranges_m": None}),
         {"classes": "Car", "ranges_m": None},
-        {"classes": ["Car"], "ranges_m": 70},
-        {"classes": ["Car"], "ranges_m": [[0, 70]]},
-        {"classes": ["Car"], "ranges_m": [[0, "far"], [0, 1]]},
+        *({"classes": ["Car"], "ranges_m": ranges} for ranges in (70, [[0, 70]], [[0, "far"], [0, 1]])),
     ],
+    ids=str,
 )
 def test_other_programs_may_write_anything_there(content: Any) -> None:
     assert scope_from_json(content) is None

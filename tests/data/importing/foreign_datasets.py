@@ -47,6 +47,7 @@ def write_argoverse2(root: Path, turn: Sequence[float] = TURN) -> Path:
 POSE, SENSOR = turned(0.06, -0.09, 0.4), turned(0.03, 0.05, -np.pi / 2)
 WORLD_M, EGO_M, SENSOR_M = np.array([105.0, 52.0, 1.0]), np.array([100.0, 50.0, 0.0]), np.array([0.9, 0.0, 1.8])
 CAR = turned(0.02, -0.04, 0.7)
+ANNOTATION = ("token", "instance_token", "translation", "size", "rotation")
 
 
 def in_sensor() -> tuple[np.ndarray, Rotation]:
@@ -73,22 +74,11 @@ def write_nuscenes(root: Path) -> Path:
         "category": [{"token": "k", "name": "vehicle.car"}, {"token": "a", "name": "animal"}],
         "instance": [{"token": "i", "category_token": "k"}, {"token": "j", "category_token": "a"}],
         "sample_annotation": [
-            {
-                "token": "1",
-                "sample_token": "sa",
-                "instance_token": "i",
-                "translation": WORLD_M.tolist(),
-                "size": [2.0, 4.5, 1.6],
-                "rotation": quaternion(CAR),
-            },
-            {
-                "token": "2",
-                "sample_token": "sa",
-                "instance_token": "j",
-                "translation": [90, 40, 0],
-                "size": [0.4, 1.0, 0.5],
-                "rotation": [1, 0, 0, 0],
-            },
+            dict(zip(ANNOTATION, row, strict=True), sample_token="sa")
+            for row in (
+                ("1", "i", WORLD_M.tolist(), [2.0, 4.5, 1.6], quaternion(CAR)),
+                ("2", "j", [90, 40, 0], [0.4, 1.0, 0.5], [1, 0, 0, 0]),
+            )
         ],
     }
     data = {"sample_token": "sa", "ego_pose_token": "e", "is_key_frame": True}

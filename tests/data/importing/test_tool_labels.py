@@ -65,46 +65,40 @@ def test_what_is_written_is_read_again_to_the_last_digit(
 
 @pytest.mark.parametrize("tool", ["sustechpoints", "supervisely", "cvat"])
 def test_tracks_are_kept(tmp_path: Path, tool: str) -> None:
-    frames = {
-        "a/1": records_from(np.repeat(BOX, 2, 0), ["Car", "Car"], None, ["7", None]),
-        "b/1": records_from(BOX, ["Car"], None, ["7"]),
-    }
+    both = records_from(np.repeat(BOX, 2, 0), ["Car", "Car"], None, ["7", None])
+    frames = {"a/1": both, "b/1": records_from(BOX, ["Car"], None, ["7"])}
     found = read(write_files(tmp_path, tool, frames), tool)
     assert {frame.recording: frame.records.track_ids for frame in found.frames} == {"a": ("7", "8"), "b": ("7",)}
 
 
 def test_conventions(tmp_path: Path) -> None:
     """One car, 4.1 m long, that looks 1.2 rad to the left of ahead, as each tool states it in its documentation."""
-    geometry = {"position": {"x": 10, "y": 1, "z": -1}, "rotation": {"x": 0, "y": 0, "z": 1.2}}
-    along_x = geometry | {"dimensions": {"x": 4.1, "y": 1.7, "z": 1.5}}
-    along_y = geometry | {
-        "dimensions": {"x": 1.7, "y": 4.1, "z": 1.5},
-        "rotation": {"x": 0, "y": 0, "z": 1.2 - math.pi / 2},
-    }
-    objects = [{"key": "k", "classTitle": "Car", "tags": []}]
-    figure = {"key": "f", "objectKey": "k", "geometryType": "cuboid_3d"}
-    psr = {"position": geometry["position"], "scale": along_x["dimensions"], "rotation": geometry["rotation"]}
-    cloud = {
-        "name": "Car",
-        "centroid": geometry["position"],
-        "dimensions": {"length": 4.1, "width": 1.7, "height": 1.5},
-        "rotations": {"x": 0, "y": 0, "z": math.degrees(1.2)},
-    }
+
+    def vector(x: float, y: float, z: float, keys: tuple[str, str, str] = ("x", "y", "z")) -> dict[str, float]:
+        return dict(zip(keys, (x, y, z), strict=True))
+
+    def sly(size: dict[str, float], yaw: float) -> str:
+        geometry = {"position": vector(10, 1, -1), "dimensions": size, "rotation": vector(0, 0, yaw)}
+        figure = {"key": "f", "objectKey": "k", "geometryType": "cuboid_3d", "geometry": geometry}
+        return json.dumps({"objects": [{"key": "k", "classTitle": "Car", "tags": []}], "figures": [figure]})
+
+    psr = {"position": vector(10, 1, -1), "scale": vector(4.1, 1.7, 1.5), "rotation": vector(0, 0, 1.2)}
+    cloud = {"name": "Car", "centroid": vector(10, 1, -1), "rotations": vector(0, 0, math.degrees(1.2))}
+    cloud |= {"dimensions": vector(4.1, 1.7, 1.5, ("length", "width", "height"))}
     texts = {
         "labelcloud/0.json": json.dumps({"objects": [cloud]}),
         "sustechpoints/label/0.json": json.dumps([{"obj_id": "1", "obj_type": "Car", "psr": psr}]),
-        "supervisely/d/ann/0.pcd.json": json.dumps({"objects": objects, "figures": [figure | {"geometry": along_y}]}),
-        "cvat/ds0/ann/0.pcd.json": json.dumps({"objects": objects, "figures": [figure | {"geometry": along_x}]}),
+        "supervisely/d/ann/0.pcd.json": sly(vector(1.7, 4.1, 1.5), 1.2 - math.pi / 2),
+        "cvat/ds0/ann/0.pcd.json": sly(vector(4.1, 1.7, 1.5), 1.2),
         "openpcdet/labels/0.txt": "10 1 -1 4.1 1.7 1.5 1.2 Car\n",
         "kitti-no-camera/0.txt": "Car 0 0 0 0 0 0 0 1.5 1.7 4.1 10 1 -1 1.2\nDontCare 0 0 0 0 0 0 0 -1 -1 -1 0 0 0 0",
     }
     write_scan(tmp_path / "scans" / "0.bin", np.ones((1, 4), np.float32))
-    for relative, text in texts.items():
-        path = tmp_path / relative
-        path.parent.mkdir(parents=True)
-        path.write_text(text)
     assert {relative.partition("/")[0] for relative in texts} == set(TOOLS)
-    for tool in TOOLS:
+    for relative, text in texts.items():
+        tool = relative.partition("/")[0]
+        (tmp_path / relative).parent.mkdir(parents=True)
+        (tmp_path / relative).write_text(text)
         (frame,) = read(tmp_path / tool, tool).frames
         np.testing.assert_allclose(frame.records.boxes, BOX.astype(np.float32), atol=1e-6, err_msg=tool)
         assert frame.records.types == ("Car",)
@@ -123,16 +117,18 @@ def test_degrees_cannot_pass_for_radians(tmp_path: Path, tool: str) -> None:
 def test_radians_cannot_pass_for_degrees(tmp_path: Path) -> None:
     source = write_files(tmp_path, "labelcloud", {"0": records_from(BOX, ["Car"])})
     path, classes = source / "0.json", source / "_classes.json"
-    content = json.loads(path.read_text())
+    content, text = json.loads(path.read_text()), classes.read_text()
     content["objects"][0]["rotations"]["z"] = -1.25
     path.write_text(json.dumps(content))
-    with pytest.raises(DatasetError, match=r"rotation of -1\.25, and centroid_abs has 0 to 360 .*centroid_rel"):
-        read(source, "labelcloud")
-    classes.write_text(classes.read_text().replace("centroid_abs", "centroid_rel"))
+    for form, message in (
+        ("centroid_abs", r"rotation of -1\.25, and centroid_abs has 0 to 360 .*centroid_rel"),
+        ("vertices", r"_classes\.json: the format vertices; set centroid_abs"),
+    ):
+        classes.write_text(text.replace("centroid_abs", form))
+        with pytest.raises(DatasetError, match=message):
+            read(source, "labelcloud")
+    classes.write_text(text.replace("centroid_abs", "centroid_rel"))
     assert read(source, "labelcloud").frames[0].records.boxes[0, 6] == pytest.approx(-1.25)
-    classes.write_text(classes.read_text().replace("centroid_rel", "vertices"))
-    with pytest.raises(DatasetError, match=r"_classes\.json: the format vertices; set centroid_abs"):
-        read(source, "labelcloud")
 
 
 @pytest.mark.parametrize(
@@ -165,14 +161,15 @@ def test_labels_and_scans_belong_together_by_name(tmp_path: Path) -> None:
     source = write_files(tmp_path, "openpcdet", frames)
     found = {frame.recording: frame.records.boxes[0, 0] for frame in read(source, "openpcdet").frames}
     assert found == {"a": 10, "b": 11}
-    (source / "2.txt").write_text("")
-    with pytest.raises(DatasetError, match=r"2\.txt: belongs to one scan 2\.\* .*, there is none; correct"):
-        read(source, "openpcdet")
-    (source / "2.txt").rename(source / "1.txt")
-    with pytest.raises(DatasetError, match=r"1\.txt: belongs to one scan"):
-        read(source, "openpcdet")
-    with pytest.raises(DatasetError, match=r"no \*\.json with labels there"):
-        read(source, "sustechpoints")
+    for name, tool, message in (
+        ("2.txt", "openpcdet", r"2\.txt: belongs to one scan 2\.\* .*, there is none; correct"),
+        ("1.txt", "openpcdet", r"1\.txt: belongs to one scan"),
+        ("1.txt", "sustechpoints", r"no \*\.json with labels there"),
+    ):
+        (source / name).write_text("")
+        with pytest.raises(DatasetError, match=message):
+            read(source, tool)
+        (source / name).unlink()
 
 
 def test_what_a_format_cannot_hold(tmp_path: Path) -> None:
@@ -196,18 +193,19 @@ def test_tilted_boxes_are_upright_and_counted(tmp_path: Path) -> None:
 
 
 def test_corrections_are_not_replaced(tmp_path: Path) -> None:
-    write_scan(tmp_path / "scans" / "0.bin", np.ones((1, 4), np.float32))
-    run = tmp_path / "detections.jsonl"
-    run.write_text(json_line(str(tmp_path / "scans" / "0.bin"), records_from(BOX, ["Car"])))
-    folder = write_prelabels(run, "openpcdet", tmp_path)
-    assert (folder / "0.txt").read_text() == "10.0000 1.0000 -1.0000 4.1000 1.7000 1.5000 1.2000 Car\n"
-    run.write_text(json_line(str(tmp_path / "scans" / "0.bin"), records_from(BOX, ["Van"])))
-    write_prelabels(run, "labelcloud", tmp_path)
-    assert "Van" in (write_prelabels(run, "openpcdet", tmp_path) / "0.txt").read_text()
-    (folder / "0.txt").write_text("corrected")
+    scan, run = tmp_path / "scans" / "0.bin", tmp_path / "detections.jsonl"
+    write_scan(scan, np.ones((1, 4), np.float32))
+    run.write_text(json_line(str(scan), records_from(BOX, ["Car"])))
+    label = write_prelabels(run, "openpcdet", tmp_path) / "0.txt"
+    assert label.read_text() == "10.0000 1.0000 -1.0000 4.1000 1.7000 1.5000 1.2000 Car\n"
+    run.write_text(json_line(str(scan), records_from(BOX, ["Van"])))
+    for tool in ("labelcloud", "openpcdet"):
+        write_prelabels(run, tool, tmp_path)
+    assert "Van" in label.read_text()
+    label.write_text("corrected")
     with pytest.raises(OutputError, match=r"0\.txt: was changed or added since .* may hold corrections"):
         write_prelabels(run, "openpcdet", tmp_path)
-    assert (folder / "0.txt").read_text() == "corrected"
+    assert label.read_text() == "corrected"
     require_unchanged(tmp_path, "labelcloud")
     (tmp_path / WRITTEN_FILE).write_text("")
     with pytest.raises(OutputError, match="was changed or added"):
@@ -215,18 +213,18 @@ def test_corrections_are_not_replaced(tmp_path: Path) -> None:
 
 
 def test_detect_correct_and_import(tmp_path: Path) -> None:
+    out, scans = tmp_path / "out", tmp_path / "scans"
+    keys = ("x_m", "y_m", "z_m", "length_m", "width_m", "height_m", "yaw_rad")
+    importing = ("import", out / "labelcloud", tmp_path / "data", "--scans", scans)
     with pytest.raises(ConfigError, match=r"--write best: no such format; there are labelcloud, "):
-        invoke("detect", "--out", tmp_path / "out", "--write", "best", "--no-pictures")
-    scans = tmp_path / "scans"
-    invoke("detect", "--out", tmp_path / "out", "--write", "labelcloud", "--no-pictures")
-    detected = json.loads((tmp_path / "out" / "detections.jsonl").read_text())
+        invoke("detect", "--out", out, "--write", "best", "--no-pictures")
+    invoke("detect", "--out", out, "--write", "labelcloud", "--no-pictures")
+    detected = json.loads((out / "detections.jsonl").read_text())
     write_scan(scans / f"{Path(detected['scan']).stem}.bin", np.ones((9, 4), np.float32))
-    source = tmp_path / "out" / "labelcloud"
-    output = invoke("import", source, tmp_path / "data", "--from", "labelcloud", "--scans", scans)
+    output = invoke(*importing, "--from", "labelcloud")
     assert f"Car {sum(box['class'] == 'Car' for box in detected['boxes'])}" in output
     split = BoxSplit(tmp_path / "data", "train")
-    for box, again in zip(detected["boxes"], split.records(split.frame_ids[0]).boxes, strict=True):
-        stated = [round(box[key], 4) for key in ("x_m", "y_m", "z_m", "length_m", "width_m", "height_m", "yaw_rad")]
-        assert [round(float(value), 4) for value in again] == stated
+    found = split.records(split.frame_ids[0]).boxes
+    np.testing.assert_allclose(found, [[box[key] for key in keys] for box in detected["boxes"]], atol=5e-5)
     with pytest.raises(ConfigError, match=r"--from nope: no such format; there are boxes, labelcloud, "):
-        invoke("import", source, tmp_path / "data", "--from", "nope", "--scans", scans)
+        invoke(*importing, "--from", "nope")

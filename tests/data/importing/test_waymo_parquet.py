@@ -32,13 +32,8 @@ def test_all_sensors_and_both_returns_are_read(tmp_path: Path) -> None:
     behind = range_image(np.array([14.0, 5.6, 1.0]))  # what the beam met beyond the edge of the vehicle
     other = np.zeros((5, WIDTH, 4), np.float32)
     other[1, 100, :2] = 7.0, 0.2
-    invoke(
-        "import",
-        write_segment(tmp_path / "waymo", further={(1, 2): behind, (2, 1): other}),
-        tmp_path / "out",
-        "--from",
-        "waymo",
-    )
+    source = write_segment(tmp_path / "waymo", further={(1, 2): behind, (2, 1): other})
+    invoke("import", source, tmp_path / "out", "--from", "waymo")
     points = BoxSplit(tmp_path / "out").points("segment/1000")
     assert len(points) == 3
     np.testing.assert_allclose(points[:2, :2], np.array([[10, 4], [14, 5.6]]), atol=0.15)
@@ -70,14 +65,13 @@ def test_a_dataset_that_was_written_by_hand_stays(tmp_path: Path) -> None:
 
 def test_mistakes_are_named(tmp_path: Path) -> None:
     source = write_segment(tmp_path / "waymo")
+    calibration = source / "lidar_calibration" / "segment.parquet"
     with pytest.raises(DatasetError, match=r"no lidar/\*\.parquet there"):
         read_waymo(tmp_path, tmp_path / "out")
-    (source / "lidar_calibration" / "segment.parquet").write_bytes(b"no parquet")
+    calibration.write_bytes(b"no parquet")
     for _ in range(2):  # the folder is marked as ours before anything else is read
         with pytest.raises(DatasetError, match=r"lidar_calibration/segment\.parquet: no readable parquet file"):
             read_waymo(source, tmp_path / "out")
-    (source / "lidar_calibration" / "segment.parquet").write_bytes(
-        (source / "lidar_box" / "segment.parquet").read_bytes()
-    )
+    calibration.write_bytes((source / "lidar_box" / "segment.parquet").read_bytes())
     with pytest.raises(DatasetError, match=r"no column `key\.laser_name`"):
         read_waymo(source, tmp_path / "out")

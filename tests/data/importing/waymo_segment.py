@@ -1,12 +1,13 @@
 """A small segment of Waymo's dataset in Parquet."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+TIME, LASER = "key.frame_timestamp_micros", "key.laser_name"
 TIMES = (1000, 2000)
 HEIGHT, WIDTH = 4, 360
 INCLINATIONS = np.radians([-12.0, -7.0, -4.0, -2.0])  # from the lowest up
@@ -50,55 +51,38 @@ def write_segment(
         (root / name).mkdir(parents=True, exist_ok=True)
         parquet.write_table(pyarrow.table(columns), root / name / "segment.parquet")
 
-    keys: dict[str, Any] = {}
+    def lists(values: Sequence[Any], kind: Any) -> Any:
+        plain = [value if value is None else np.ravel(value).tolist() for value in values]
+        return pyarrow.array(plain, pyarrow.list_(kind))
+
     seen = {(1, 1): range_image(np.array([10.0 + moved_m, 4.0, 1.0])), **(further or {})}
     rows = [(time, laser) for time in TIMES for laser in (1, 2)]
-    keys["key.frame_timestamp_micros"], keys["key.laser_name"] = map(list, zip(*rows, strict=True))
-    images: dict[str, Any] = {}
+    columns: dict[str, Any] = {TIME: [time for time, _ in rows], LASER: [laser for _, laser in rows]}
     for number in (1, 2):
         own = [seen.get((laser, number)) for _, laser in rows]
         name = f"[LiDARComponent].range_image_return{number}"
-        values = [None if image is None else image.ravel().tolist() for image in own]
-        images[f"{name}.values"] = pyarrow.array(values, pyarrow.list_(pyarrow.float32()))
-        shapes = [None if image is None else list(image.shape) for image in own]
-        images[f"{name}.shape"] = pyarrow.array(shapes, pyarrow.list_(pyarrow.int32()))
-    write("lidar", keys | images)
+        columns[f"{name}.values"] = lists(own, pyarrow.float32())
+        columns[f"{name}.shape"] = lists([image if image is None else image.shape for image in own], pyarrow.int32())
+    write("lidar", columns)
     box = ("center.x", "center.y", "center.z", "size.x", "size.y", "size.z", "heading")
-    write(
-        "lidar_box",
-        {"key.frame_timestamp_micros": [1000], "key.laser_object_id": ["a"], "[LiDARBoxComponent].type": [1]}
-        | {f"[LiDARBoxComponent].box.{name}": [value] for name, value in zip(box, BOX, strict=True)},
-    )
-    calibration = "[LiDARCalibrationComponent]"
-    write(
-        "lidar_calibration",
-        {
-            "key.laser_name": [1, 2],
-            f"{calibration}.extrinsic.transform": [extrinsic().ravel().tolist()] * 2,
-            f"{calibration}.beam_inclination.values": [INCLINATIONS.tolist(), None],
-            f"{calibration}.beam_inclination.min": [-0.2, -0.2],
-            f"{calibration}.beam_inclination.max": [0.0, 0.0],
-        },
-    )
+    labels = {f"[LiDARBoxComponent].box.{name}": [value] for name, value in zip(box, BOX, strict=True)}
+    write("lidar_box", {TIME: [1000], "key.laser_object_id": ["a"], "[LiDARBoxComponent].type": [1]} | labels)
+    calibration = {
+        "extrinsic.transform": [extrinsic().ravel().tolist()] * 2,
+        "beam_inclination.values": [INCLINATIONS.tolist(), None],
+        "beam_inclination.min": [-0.2, -0.2],
+        "beam_inclination.max": [0.0, 0.0],
+    }
+    columns = {f"[LiDARCalibrationComponent].{name}": value for name, value in calibration.items()}
+    write("lidar_calibration", {LASER: [1, 2]} | columns)
     if moved_m:
         world = np.eye(4)
         world[:2, :2], world[:3, 3] = [[0, -1], [1, 0]], [100, 50, 3]  # the car drives along the world's y
-        write(
-            "vehicle_pose",
-            {
-                "key.frame_timestamp_micros": list(TIMES),
-                "[VehiclePoseComponent].world_from_vehicle.transform": [world.ravel().tolist()] * 2,
-            },
-        )
+        vehicle = "[VehiclePoseComponent].world_from_vehicle.transform"
+        write("vehicle_pose", {TIME: list(TIMES), vehicle: [world.ravel().tolist()] * 2})
         pose = np.zeros((HEIGHT, WIDTH, 6), np.float32)
         pose[..., 2:] = [np.pi / 2, 100, 50 - moved_m, 3]
-        write(
-            "lidar_pose",
-            {
-                "key.frame_timestamp_micros": list(TIMES),
-                "key.laser_name": [1, 1],
-                "[LiDARPoseComponent].range_image_return1.values": [pose.ravel().tolist()] * 2,
-                "[LiDARPoseComponent].range_image_return1.shape": [list(pose.shape)] * 2,
-            },
-        )
+        pixels = "[LiDARPoseComponent].range_image_return1"
+        values = {f"{pixels}.values": [pose.ravel().tolist()] * 2, f"{pixels}.shape": [list(pose.shape)] * 2}
+        write("lidar_pose", {TIME: list(TIMES), LASER: [1, 1]} | values)
     return root

@@ -5,8 +5,10 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from shapely.geometry import Polygon
 
 from asca_pillars.data.kitti import KittiSplit, objects_from_boxes, write_calibration, write_image_set, write_labels
+from asca_pillars.geometry.boxes import footprints
 from asca_pillars.scans.scan_reader import write_scan
 from tests.helpers.scenes import CALIBRATION, SIZES
 
@@ -43,6 +45,11 @@ def stand(name: str, x: float, y: float, yaw: float = 0.0, plane: Sequence[float
     length, width, height = SIZES[name]
     z = plane[0] * x + plane[1] * y + plane[2] + height / 2
     return np.array([x, y, z, length, width, height, yaw], np.float32)
+
+
+def polygons(boxes: NDArray[np.floating]) -> list[Polygon]:
+    """Their outlines from above."""
+    return [Polygon(outline) for outline in footprints(boxes.astype(float))]
 
 
 def street(seed: int, plane: Sequence[float] = LEVEL) -> tuple[NDArray[np.float32], NDArray[np.float32], list[str]]:

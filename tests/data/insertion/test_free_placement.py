@@ -1,19 +1,20 @@
 """Where an object may be put, and what it hides there."""
 
+from collections.abc import Sequence
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from shapely.geometry import Polygon
 
 from asca_pillars.data.frames import LabeledFrame
 from asca_pillars.data.insertion.free_placement import MARGIN_M, Scene, is_clear, move_to_free_position, rays_entering
-from asca_pillars.data.insertion.free_space import FreeSpace, find_free_space
+from asca_pillars.data.insertion.free_space import find_free_space
 from asca_pillars.data.insertion.gt_database import StoredObject
 from asca_pillars.detection.anchors import IGNORED
-from asca_pillars.geometry.boxes import footprints, points_in_boxes, wrap_angle
+from asca_pillars.geometry.boxes import points_in_boxes, wrap_angle
 from asca_pillars.ops.pillar.grid import PillarGrid
-from tests.data.insertion.simple_streets import LEVEL, cast, stand, street
+from tests.data.insertion.simple_streets import LEVEL, cast, polygons, stand, street
 
 GRID = PillarGrid(x_range_m=(0, 40.96), y_range_m=(-20.48, 20.48), v_max_m=0.32, zones=1).ranges
 NO_BOXES = np.zeros((0, 7), np.float32)
@@ -27,6 +28,15 @@ def scanned(box: np.ndarray, label: int = 0) -> StoredObject:
     """An object as the database has it: alone on the street."""
     points = cast(LEVEL, box[None])
     return StoredObject(box, label, points[points_in_boxes(points, box[None])[:, 0]])
+
+
+def scene_of(*boxes: np.ndarray, labels: Sequence[int] = (), items: Sequence[StoredObject] = ()) -> Scene:
+    """A level street with these labelled boxes and inserted items."""
+    array = np.array(boxes, np.float32).reshape(-1, 7)
+    scene = Scene(frame_of(cast(LEVEL, array), array, [*labels]), array)
+    for item in items:
+        scene.add(item)
+    return scene
 
 
 coordinates = st.floats(-30, 30)
@@ -114,42 +124,26 @@ def local(item: StoredObject) -> np.ndarray:
     return away @ np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]])
 
 
-def polygons(boxes: np.ndarray) -> list[Polygon]:
-    return [Polygon(outline) for outline in footprints(boxes.astype(float))]
-
-
 def test_places_are_found_where_there_are_some() -> None:
     points, boxes, _ = street(1)
-    space = find_free_space(points)
-    scene = Scene(frame_of(points, boxes, [0] * 4), boxes)
-    found = [
-        move_to_free_position(scanned(stand("Pedestrian", 12, 0)), space, scene, GRID, np.random.default_rng(seed))
-        for seed in range(10)
-    ]
-    assert all(item is not None for item in found) and len({float(item.box[1]) for item in found if item}) >= 8
+    space, scene = find_free_space(points), Scene(frame_of(points, boxes, [0] * 4), boxes)
+    item, draws = scanned(stand("Pedestrian", 12, 0)), map(np.random.default_rng, range(10))
+    found = [move_to_free_position(item, space, scene, GRID, rng) for rng in draws]
+    assert all(found) and len({float(placed.box[1]) for placed in found if placed}) >= 8
 
 
 def test_no_place_without_ground_or_at_a_distance_without_any() -> None:
     points, boxes, _ = street(1)
-    scene = Scene(frame_of(points, boxes, [0] * 4), boxes)
-    nowhere = find_free_space(points[:0])
-    rng = np.random.default_rng(0)
-    assert move_to_free_position(scanned(stand("Car", 10, 0)), nowhere, scene, GRID, rng) is None
-    space: FreeSpace = find_free_space(points)
-    assert move_to_free_position(scanned(stand("Car", 2.0, 0)), space, scene, GRID, rng) is None
+    scene, rng = Scene(frame_of(points, boxes, [0] * 4), boxes), np.random.default_rng(0)
+    for x, ground in ((10, points[:0]), (2.0, points)):
+        assert move_to_free_position(scanned(stand("Car", x, 0)), find_free_space(ground), scene, GRID, rng) is None
 
 
 def test_what_is_behind_an_inserted_object_disappears() -> None:
-    behind, beside = stand("Car", 20, 0), stand("Pedestrian", 15, 6)
-    points = cast(LEVEL, np.array([behind, beside]))
-    scene = Scene(frame_of(points, np.array([behind, beside]), [0, 1]), np.array([behind, beside]))
-    item = scanned(stand("Car", 10, 0, np.pi / 2), label=2)
-    scene.add(item)
-    frame = scene.frame_with_inserted(min_points=1)
-    hidden = rays_entering(points, item.box[None])
-    assert hidden.sum() > 100 and len(frame.points) == (~hidden).sum() + len(item.points)
-    assert np.array_equal(frame.points[-len(item.points) :], item.points)
-    assert np.array_equal(frame.points[: -len(item.points)], points[~hidden])
+    behind, beside, item = stand("Car", 20, 0), stand("Pedestrian", 15, 6), scanned(stand("Car", 10, 0, np.pi / 2), 2)
+    scene, points = scene_of(behind, beside, labels=[0, 1], items=[item]), cast(LEVEL, np.array([behind, beside]))
+    frame, hidden = scene.frame_with_inserted(min_points=1), rays_entering(points, item.box[None])
+    assert hidden.sum() > 100 and np.array_equal(frame.points, np.concatenate([points[~hidden], item.points]))
     assert np.array_equal(frame.boxes, [behind, beside, item.box]) and frame.labels[1:].tolist() == [1, 2]
     # The car behind keeps its roof, or nothing; either way its label says whether there is something to find.
     left = points_in_boxes(frame.points, behind[None]).sum()
@@ -159,21 +153,16 @@ def test_what_is_behind_an_inserted_object_disappears() -> None:
 
 def test_an_inserted_object_needs_as_many_points_as_a_labelled_one() -> None:
     """Exactly so many are enough."""
-    scene = Scene(frame_of(cast(LEVEL, NO_BOXES), NO_BOXES, []), NO_BOXES)
     item = scanned(stand("Car", 10, 0), label=2)
-    scene.add(item)
     for more, label in ((0, 2), (1, IGNORED)):
-        assert scene.frame_with_inserted(min_points=len(item.points) + more).labels.tolist() == [label]
+        assert scene_of(items=[item]).frame_with_inserted(len(item.points) + more).labels.tolist() == [label]
 
 
 def test_a_scan_drawn_with_the_object_in_it_is_what_insertion_gives() -> None:
     """Ground truth: cast the rays once more with the object standing there."""
-    boxes = np.array([stand("Car", 18, 3, 0.4), stand("Pedestrian", 12, -3)])
-    item = scanned(stand("Car", 11, 1, 0.3), label=0)
-    scene = Scene(frame_of(cast(LEVEL, boxes), boxes, [0, 1]), boxes)
-    scene.add(item)
-    inserted = scene.frame_with_inserted(min_points=1).points
-    truth = cast(LEVEL, np.concatenate([boxes, item.box[None]]))
+    boxes, item = [stand("Car", 18, 3, 0.4), stand("Pedestrian", 12, -3)], scanned(stand("Car", 11, 1, 0.3))
+    inserted = scene_of(*boxes, labels=[0, 1], items=[item]).frame_with_inserted(min_points=1).points
+    truth = cast(LEVEL, np.array([*boxes, item.box]))
     order = [np.lexsort(np.round(cloud[:, :3], 3).T) for cloud in (inserted, truth)]
     assert len(inserted) == len(truth)
     np.testing.assert_allclose(inserted[order[0]], truth[order[1]], atol=2e-3)
@@ -182,38 +171,25 @@ def test_a_scan_drawn_with_the_object_in_it_is_what_insertion_gives() -> None:
 def test_objects_do_not_hide_one_another() -> None:
     """Neither may most of a labelled object be hidden, nor most of one inserted before, nor of the new one itself."""
     far, near, beside = stand("Pedestrian", 16, 0), stand("Car", 10, 0, np.pi / 2), stand("Car", 10, 6)
-    labeled = Scene(frame_of(cast(LEVEL, far[None]), far[None], [1]), far[None])
-    assert not labeled.keeps_all_visible(scanned(near)) and labeled.keeps_all_visible(scanned(beside))
-    ignored = Scene(frame_of(cast(LEVEL, far[None]), far[None], [IGNORED]), far[None])
-    assert ignored.keeps_all_visible(scanned(near))
-    empty = frame_of(cast(LEVEL, NO_BOXES), NO_BOXES, [])
-    for first, second in ((far, near), (near, far)):
-        scene = Scene(empty, NO_BOXES)
-        scene.add(scanned(first))
-        assert not scene.keeps_all_visible(scanned(second)) and scene.keeps_all_visible(scanned(beside))
+    assert scene_of(far, labels=[IGNORED]).keeps_all_visible(scanned(near))
+    for scene, hiding in (
+        (scene_of(far, labels=[1]), near),
+        (scene_of(items=[scanned(far)]), near),
+        (scene_of(items=[scanned(near)]), far),
+    ):
+        assert not scene.keeps_all_visible(scanned(hiding)) and scene.keeps_all_visible(scanned(beside))
 
 
-def test_a_car_hides_the_edge_of_one_that_stands_beside_its_shadow() -> None:
-    near, far = scanned(stand("Car", 10, 0, np.pi / 2)), scanned(stand("Car", 20, 4.5, np.pi / 2))
+@pytest.mark.parametrize(
+    ("behind", "share"), [(stand("Pedestrian", 16, 0), (0, 0.5)), (stand("Car", 20, 4.5, np.pi / 2), (0.01, 0.99))]
+)
+def test_inserted_objects_hide_each_other(behind: np.ndarray, share: tuple[float, float]) -> None:
+    """As GT-Aug may place them: what is behind, or its edge, loses its points, in either order, and then its label."""
+    far, near = scanned(behind, 1), scanned(stand("Car", 10, 0, np.pi / 2), 0)
     left = int((~rays_entering(far.points, near.box[None])).sum())
-    assert 0 < left < len(far.points)
+    assert share[0] <= left / len(far.points) < share[1]
     for items in ((far, near), (near, far)):
-        scene = Scene(frame_of(cast(LEVEL, NO_BOXES), NO_BOXES, []), NO_BOXES)
-        for item in items:
-            scene.add(item)
-        assert points_in_boxes(scene.frame_with_inserted(1).points, far.box[None]).sum() == left
-
-
-def test_inserted_objects_hide_each_other() -> None:
-    """As GT-Aug may place them: the one behind loses its points, in either order, and then its label."""
-    far, near = scanned(stand("Pedestrian", 16, 0), 1), scanned(stand("Car", 10, 0, np.pi / 2), 0)
-    empty = frame_of(cast(LEVEL, NO_BOXES), NO_BOXES, [])
-    left = int((~rays_entering(far.points, near.box[None])).sum())
-    assert left < len(far.points) / 2
-    for items in ((far, near), (near, far)):
-        scene = Scene(empty, NO_BOXES)
-        for item in items:
-            scene.add(item)
+        scene = scene_of(items=items)
         labels = scene.frame_with_inserted(min_points=left + 1).labels.tolist()
         assert labels == [IGNORED if item is far else 0 for item in items]
         assert points_in_boxes(scene.frame_with_inserted(1).points, far.box[None]).sum() == left

@@ -5,6 +5,7 @@ import os
 import pickle
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -26,10 +27,12 @@ def split(tmp_path: Path) -> KittiSplit:
     return KittiSplit(write_streets(tmp_path / "data", 3), "train")
 
 
-def prepare(
-    split: KittiSplit, prepared: Path, names: tuple[str, ...] = TYPES, camera_view: bool = True
-) -> ObjectDatabase:
-    return prepare_database(split, names, prepared, camera_view=camera_view)
+def prepare(split: KittiSplit, prepared: Path, names: tuple[str, ...] = TYPES, **options: Any) -> ObjectDatabase:
+    return prepare_database(split, names, prepared, **{"camera_view": True} | options)
+
+
+def contents(database: ObjectDatabase) -> list[bytes]:
+    return [database.path.with_suffix(suffix).read_bytes() for suffix in (".json", ".npy", ".npz")]
 
 
 def rename(split: KittiSplit, frame_id: str, index: int, name: str) -> None:
@@ -43,22 +46,17 @@ def test_it_holds_every_labelled_object_with_its_points(split: KittiSplit, tmp_p
     rename(split, "000002", 0, "Truck")
     database = prepare(split, tmp_path / "prepared")
     frames = [read_frame(split, frame_id, TYPES, min_points=0) for frame_id in split.frame_ids]
-    kept = [frame.labels >= 0 for frame in frames]
-    assert len(database) == 10 and sum(mask.sum() for mask in kept) == 10
-    assert np.array_equal(database.boxes, np.concatenate([f.boxes[k] for f, k in zip(frames, kept, strict=True)]))
-    assert np.array_equal(database.labels, np.concatenate([f.labels[k] for f, k in zip(frames, kept, strict=True)]))
+    kept = [(frame, frame.labels >= 0) for frame in frames]
+    assert len(database) == 10 and database.point_counts.sum() > 100
+    assert np.array_equal(database.boxes, np.concatenate([frame.boxes[mask] for frame, mask in kept]))
+    assert np.array_equal(database.labels, np.concatenate([frame.labels[mask] for frame, mask in kept]))
     assert database.frames.tolist() == [0] * 4 + [1] * 3 + [2] * 3
     for index in range(len(database)):
         item, frame = database[index], frames[database.frames[index]]
         own = frame.points[points_in_boxes(frame.points, item.box[None])[:, 0]]
         assert np.array_equal(item.points, own) and item.points.dtype == np.float32
         assert item.label == database.labels[index] and len(own) == database.point_counts[index]
-    assert database.point_counts.sum() > 100
-
-
-def test_what_is_taken_out_is_a_copy(split: KittiSplit, tmp_path: Path) -> None:
-    database = prepare(split, tmp_path / "prepared")
-    before = database[0].points.copy()
+    before = database[0].points.copy()  # what is taken out is a copy
     database[0].points[:] = 0
     database[0].box[:] = 0
     assert np.array_equal(database[0].points, before) and database.boxes[0].any()
@@ -109,30 +107,18 @@ def test_a_scan_that_is_not_there_is_named(split: KittiSplit, tmp_path: Path) ->
         prepare(split, tmp_path / "prepared")
 
 
-def test_it_is_the_same_everywhere(split: KittiSplit, tmp_path: Path) -> None:
-    one, other = (prepare(split, tmp_path / name).path for name in ("a", "b"))
-    assert one.name == other.name
-    for suffix in (".json", ".npy", ".npz"):
-        assert one.with_suffix(suffix).read_bytes() == other.with_suffix(suffix).read_bytes()
-
-
-def test_any_number_of_processes_writes_the_same(
+def test_any_number_of_processes_writes_the_same_everywhere(
     split: KittiSplit, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """The points are written as they come, and how many they are stands before them, as NumPy has it."""
     monkeypatch.setattr(gt_database, "_AT_ONCE", 1)  # three frames are too few for two processes otherwise
-    alone = prepare(split, tmp_path / "alone").path
+    alone, other = prepare(split, tmp_path / "alone"), prepare(split, tmp_path / "other")
     monkeypatch.setattr(gt_database, "read_frame", lambda *_, **__: pytest.fail("read in this process"))
-    shared = prepare_database(split, TYPES, tmp_path / "shared", camera_view=True, workers=2).path
-    assert alone.name == shared.name
-    for suffix in (".json", ".npy", ".npz"):
-        assert alone.with_suffix(suffix).read_bytes() == shared.with_suffix(suffix).read_bytes()
-
-
-def test_the_points_are_a_file_as_numpy_writes_it(split: KittiSplit, tmp_path: Path) -> None:
-    """They are written as they come, and how many they are stands before them."""
-    path = prepare(split, tmp_path / "prepared").path.with_suffix(".npy")
-    np.save(tmp_path / "again.npy", np.load(path))
-    assert path.read_bytes() == (tmp_path / "again.npy").read_bytes()
+    shared = prepare(split, tmp_path / "shared", workers=2)
+    assert alone.path.name == other.path.name == shared.path.name
+    assert contents(alone) == contents(other) == contents(shared)
+    np.save(tmp_path / "again.npy", np.load(alone.path.with_suffix(".npy")))
+    assert contents(alone)[1] == (tmp_path / "again.npy").read_bytes()
 
 
 @pytest.mark.parametrize("workers", [1, 2])
@@ -143,12 +129,8 @@ def test_a_build_that_fails_leaves_nothing_to_be_used(
     text = split.label_path("000002").read_text()
     split.label_path("000002").write_text("Car 1 2\n")
     with pytest.raises(DatasetError, match="000002"):
-        prepare_database(split, TYPES, tmp_path / "prepared", camera_view=True, workers=workers)
-    assert (
-        not list((tmp_path / "prepared").rglob("*.n*"))
-        and not list((tmp_path / "prepared").rglob("*.json"))
-        and not list((tmp_path / "prepared").rglob(".*"))
-    )
+        prepare(split, tmp_path / "prepared", workers=workers)
+    assert not [path for name in ("*.n*", "*.json", ".*") for path in (tmp_path / "prepared").rglob(name)]
     split.label_path("000002").write_text(text)
     assert len(prepare(split, tmp_path / "prepared")) == 12
 

@@ -1,6 +1,7 @@
 """Insertion as a whole: which classes, how many, the same for the same seed, and nothing else changed."""
 
 import dataclasses
+import itertools
 from pathlib import Path
 from typing import Any
 
@@ -8,23 +9,31 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from shapely.geometry import Polygon
 from torch.utils.data import DataLoader
 
 from asca_pillars.base.errors import ConfigError, DatasetError
 from asca_pillars.cli.prepare import prepare
-from asca_pillars.config.tree import DataConfig
+from asca_pillars.config.tree import Config, DataConfig
 from asca_pillars.data.augment import augment
+from asca_pillars.data.boxes.box_records import json_line, records_from
+from asca_pillars.data.boxes.box_split import BoxSplit
 from asca_pillars.data.frames import LabeledFrame, read_frame, within_ranges
-from asca_pillars.data.insertion.gt_database import ObjectDatabase, prepare_database
+from asca_pillars.data.insertion.gt_database import prepare_database
 from asca_pillars.data.insertion.insert_objects import Inserter, insert_objects, insertion_shares
-from asca_pillars.data.kitti import KittiSplit, boxes_from_objects, objects_3d, read_labels, write_labels
-from asca_pillars.geometry.boxes import footprints, points_in_boxes
+from asca_pillars.data.kitti import (
+    KittiSplit,
+    boxes_from_objects,
+    objects_3d,
+    read_labels,
+    write_image_set,
+    write_labels,
+)
+from asca_pillars.geometry.boxes import points_in_boxes
 from asca_pillars.scans.scan_reader import write_scan
 from asca_pillars.training.dataset import Collate, open_dataset
 from asca_pillars.training.shared_batches import loader_context
 from tests.data.insertion.inserters import METHODS, config, open_inserter
-from tests.data.insertion.simple_streets import TYPES, write_streets
+from tests.data.insertion.simple_streets import TYPES, polygons, write_streets
 from tests.helpers.scenes import SPEC
 
 FRAMES = 6
@@ -39,6 +48,10 @@ def inserter_of(root: Path, method: str, **insert: object) -> Inserter:
     return open_inserter(KittiSplit(root, "train"), config(method, **insert))
 
 
+def prepared_in(folder: Path, settings_: Config) -> Config:
+    return dataclasses.replace(settings_, data=dataclasses.replace(settings_.data, prepared=str(folder)))
+
+
 def frame_of(root: Path, number: int) -> LabeledFrame:
     return read_frame(KittiSplit(root, "train"), f"{number:06d}", TYPES)
 
@@ -48,8 +61,8 @@ def augmented(inserter: Inserter, root: Path, number: int, seed: int = 0) -> tup
     return before, insert_objects(before, inserter, np.random.default_rng((seed, number)))
 
 
-def polygons(boxes: np.ndarray) -> list[Polygon]:
-    return [Polygon(outline) for outline in footprints(boxes.astype(float))]
+def assert_same(one: LabeledFrame, other: LabeledFrame) -> None:
+    assert np.array_equal(one.points, other.points) and np.array_equal(one.boxes, other.boxes)
 
 
 @settings(max_examples=200, deadline=None)
@@ -70,29 +83,32 @@ def test_shares_fill_the_classes_up_to_one_level(pairs: list[tuple[float, float]
     assert (after[~filled] >= after[filled].min() - 1e-6 * after.max()).all()
 
 
-def test_shares_by_hand() -> None:
-    # 4 + 1 + 0 objects and 6 more make 11; the car's 4 exceed a third: the others share 7, 3.5 each.
-    assert insertion_shares(np.array([4.0, 1.0, 0.0]), np.ones(3), 6) * 6 == pytest.approx([0, 2.5, 3.5])
-    # Twice as many pedestrians as of the others: 11 = 2.75 + 5.5 + 2.75, but there are 4 cars; 7 = 4.67 + 2.33.
-    assert insertion_shares(np.array([4.0, 1.0, 0.0]), np.array([1, 2, 1.0]), 6) * 6 == pytest.approx(
-        [0, 11 / 3, 7 / 3]
-    )
+@pytest.mark.parametrize(
+    ("wanted", "added"),
+    [
+        # 4 + 1 + 0 objects and 6 more make 11; the car's 4 exceed a third: the others share 7, 3.5 each.
+        ([1, 1, 1], [0, 2.5, 3.5]),
+        # Twice as many pedestrians as of the others: 11 = 2.75 + 5.5 + 2.75, but there are 4 cars; 7 = 4.67 + 2.33.
+        ([1, 2, 1], [0, 11 / 3, 7 / 3]),
+    ],
+)
+def test_shares_by_hand(wanted: list[float], added: list[float]) -> None:
+    shares = insertion_shares(np.array([4.0, 1.0, 0.0]), np.array(wanted, float), 6)
+    assert shares * 6 == pytest.approx(added)
 
 
 @pytest.mark.parametrize("method", METHODS)
 def test_what_is_inserted_touches_nothing(root: Path, method: str) -> None:
     inserter = inserter_of(root, method, objects=8)
     inserted = 0
-    for number in range(FRAMES):
-        for seed in range(5):
-            before, after = augmented(inserter, root, number, seed)
-            new = polygons(after.boxes[len(before.boxes) :])
-            others = polygons(before.boxes)
-            if method == "rs_aug":
-                others += polygons(inserter.free_space(before.frame_id).clusters)
-            assert not any(one.intersection(other).area > 1e-6 for one in new for other in others)
-            assert not any(a.intersection(b).area > 1e-6 for i, a in enumerate(new) for b in new[:i])
-            inserted += len(new)
+    for number, seed in itertools.product(range(FRAMES), range(5)):
+        before, after = augmented(inserter, root, number, seed)
+        new, others = polygons(after.boxes[len(before.boxes) :]), polygons(before.boxes)
+        if method == "rs_aug":
+            others += polygons(inserter.free_space(before.frame_id).clusters)
+        assert not any(one.intersection(other).area > 1e-6 for one in new for other in others)
+        assert not any(a.intersection(b).area > 1e-6 for a, b in itertools.combinations(new, 2))
+        inserted += len(new)
     assert inserted > 2 * FRAMES * 5
 
 
@@ -125,7 +141,7 @@ def test_objects_of_gt_aug_stand_where_they_stood(root: Path) -> None:
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_other_types_are_in_the_way_too(root: Path, tmp_path: Path, method: str) -> None:
+def test_other_types_are_in_the_way_too(tmp_path: Path, method: str) -> None:
     """A lorry, which is no class, stands over the whole street: there is no room for anything."""
     split = KittiSplit(write_streets(tmp_path, 2), "train")
     inserter = open_inserter(split, config(method))
@@ -134,7 +150,7 @@ def test_other_types_are_in_the_way_too(root: Path, tmp_path: Path, method: str)
     write_labels(split.label_path("000000"), [lorry])
     before, after = augmented(inserter, tmp_path, 0)
     assert len(boxes_from_objects([lorry], split.calibration("000000"))) == 1 and len(before.boxes) == 0
-    assert np.array_equal(before.points, after.points) and len(after.boxes) == 0
+    assert_same(before, after)
 
 
 @pytest.mark.parametrize(
@@ -146,10 +162,9 @@ def test_counts_approach_the_proportions(
 ) -> None:
     inserter = inserter_of(root, "rs_aug", objects=4, proportions=proportions)
     before, after = np.zeros(3), np.zeros(3)
-    for number in range(FRAMES):
-        for seed in range(8):
-            for counts, frame in zip((before, after), augmented(inserter, root, number, seed), strict=True):
-                counts += np.bincount(frame.labels[frame.labels >= 0], minlength=3)
+    for number, seed in itertools.product(range(FRAMES), range(8)):
+        for counts, frame in zip((before, after), augmented(inserter, root, number, seed), strict=True):
+            counts += np.bincount(frame.labels[frame.labels >= 0], minlength=3)
     if expected is None:  # the class that was not asked for stays as it is
         assert after[1] == before[1] and after[2] > 1.5 * before[2]
         return
@@ -160,41 +175,27 @@ def test_counts_approach_the_proportions(
 
 @pytest.mark.parametrize("method", METHODS)
 def test_samples_depend_on_seed_epoch_and_frame_alone(root: Path, method: str) -> None:
-    frames = open_dataset(root, config(method), training=True)
-    again = open_dataset(root, config(method), training=True)
-    late = [again.sample(epoch, number).frame for epoch, number in ((1, 3), (0, 3), (0, 2))][1:]
-    for sample, number in zip(late, (3, 2), strict=True):
-        expected = frames.sample(0, number).frame
-        assert np.array_equal(sample.points, expected.points) and np.array_equal(sample.boxes, expected.boxes)
-    first, second = frames.sample(0, 3).frame, frames.sample(1, 3).frame
-    assert len(first.points) != len(second.points) or not np.array_equal(first.points, second.points)
-
-
-@pytest.mark.parametrize("method", METHODS)
-def test_from_an_epoch_on_nothing_is_inserted(root: Path, method: str) -> None:
-    always, early, never = (
+    """Not on the order in which they are asked for, as by a run that resumes; from an epoch on nothing is inserted."""
+    always, again, early, never = (
         open_dataset(root, settings_, training=True)
-        for settings_ in (config(method), config(method, disable_after_epoch=2), config("none"))
+        for settings_ in (config(method), config(method), config(method, disable_after_epoch=2), config("none"))
     )
-    for epoch in range(4):
-        # Which is why the order in which samples are asked for, as by a run that resumes, does not matter.
+    again.sample(1, 3)
+    for number in (3, 2):
+        assert_same(again.sample(0, number).frame, always.sample(0, number).frame)
+    for epoch, number in itertools.product(range(4), (3, 2)):
         like = always if epoch < 2 else never
-        for number in (3, 2):
-            sample, expected = early.sample(epoch, number).frame, like.sample(epoch, number).frame
-            assert np.array_equal(sample.points, expected.points) and np.array_equal(sample.boxes, expected.boxes)
+        assert_same(early.sample(epoch, number).frame, like.sample(epoch, number).frame)
+    first, second = always.sample(0, 3).frame, always.sample(1, 3).frame
+    assert len(first.points) != len(second.points) or not np.array_equal(first.points, second.points)
     assert len(early.sample(1, 3).frame.boxes) > len(early.sample(2, 3).frame.boxes)
 
 
 def test_any_number_of_workers_gives_the_same(root: Path) -> None:
     frames = open_dataset(root, config("rs_aug"), training=True)
     batches = [[(0, number), (1, number)] for number in range(FRAMES)]
-    loader = DataLoader(
-        frames,
-        batch_sampler=batches,
-        num_workers=2,
-        collate_fn=Collate(frames.preparation),
-        multiprocessing_context=loader_context(),
-    )
+    options: dict[str, Any] = {"collate_fn": Collate(frames.preparation), "multiprocessing_context": loader_context()}
+    loader = DataLoader(frames, batch_sampler=batches, num_workers=2, **options)
     for batch, indices in zip(loader, batches, strict=True):
         for boxes, labels, index in zip(batch.boxes, batch.labels, indices, strict=True):
             expected = frames.sample(*index).frame
@@ -203,17 +204,15 @@ def test_any_number_of_workers_gives_the_same(root: Path) -> None:
 
 def test_without_insertion_everything_is_as_before(root: Path, tmp_path: Path) -> None:
     """Neither method `none` nor 0 objects changes what else is drawn, and no folder is made for `none`."""
-    plain = config("none")
-    folder = tmp_path / "prepared"
-    plain = dataclasses.replace(plain, data=dataclasses.replace(plain.data, prepared=str(folder)))
+    plain = prepared_in(tmp_path / "prepared", config("none"))
     rng = np.random.default_rng((plain.train.seed, 2, 4))
     frame = within_ranges(augment(frame_of(root, 4), plain.augment, rng), SPEC.grid.ranges)
     pillars = SPEC.pillarize(frame.points)
     for settings_ in (plain, config("rs_aug", objects=0), config("gt_aug", objects=0)):
         sample = open_dataset(root, settings_, training=True).sample(2, 4)
-        assert np.array_equal(sample.frame.points, frame.points) and np.array_equal(sample.frame.boxes, frame.boxes)
+        assert_same(sample.frame, frame)
         assert np.array_equal(sample.prepared.pillars.features, pillars.features)
-    assert not folder.exists()
+    assert not (tmp_path / "prepared").exists()
 
 
 def test_validation_frames_get_nothing(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -225,23 +224,20 @@ def test_validation_frames_get_nothing(root: Path, monkeypatch: pytest.MonkeyPat
 def test_a_frame_without_ground_or_points_stays_as_it_is(tmp_path: Path) -> None:
     split = KittiSplit(write_streets(tmp_path, 3), "train")
     inserter = open_inserter(split, config("rs_aug"))
-    write_scan(split.scan_path("000000"), np.array([[9, 0, 0, 0.5]], np.float32))
-    write_scan(split.scan_path("000001"), np.array([[-9, 0, 0, 0.5]], np.float32))
-    for number in (0, 1):
-        before, after = augmented(inserter, tmp_path, number)
-        assert np.array_equal(before.points, after.points) and np.array_equal(before.boxes, after.boxes)
+    for number, x in enumerate((9, -9)):
+        write_scan(split.scan_path(f"00000{number}"), np.array([[x, 0, 0, 0.5]], np.float32))
+        assert_same(*augmented(inserter, tmp_path, number))
 
 
 def test_a_class_without_objects_is_named(tmp_path: Path) -> None:
     split = KittiSplit(write_streets(tmp_path, 2), "train")
     for frame_id in split.frame_ids:
-        text = split.label_path(frame_id).read_text()
-        split.label_path(frame_id).write_text(text.replace("Cyclist", "Misc"))
+        path = split.label_path(frame_id)
+        path.write_text(path.read_text().replace("Cyclist", "Misc"))
     with pytest.raises(DatasetError, match=r"list `train` has no Cyclist with a point in it; .* --propose") as caught:
         open_dataset(tmp_path, config("rs_aug"), training=True)
     assert "\n" not in str(caught.value) and str(tmp_path) in str(caught.value)
-    without = inserter_of(tmp_path, "rs_aug", proportions={"Car": 1, "Pedestrian": 1})
-    assert without.shares[2] == 0
+    assert inserter_of(tmp_path, "rs_aug", proportions={"Car": 1, "Pedestrian": 1}).shares[2] == 0
     with pytest.raises(DatasetError, match="has no Car with 1000000 or more points"):
         inserter_of(tmp_path, "gt_aug", min_points=1_000_000, proportions={"Car": 1})
 
@@ -256,35 +252,64 @@ def test_impossible_proportions_are_refused(proportions: dict[str, float], messa
 
 
 def test_the_database_is_built_by_as_many_processes_as_load(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    asked = []
-
-    def build(*args: Any, workers: int, **more: Any) -> ObjectDatabase:
-        asked.append(workers)
-        return prepare_database(*args, **more)
-
-    monkeypatch.setattr("asca_pillars.data.insertion.insert_objects.prepare_database", build)
-    settings_ = config("gt_aug")
-    open_inserter(KittiSplit(root, "train"), dataclasses.replace(settings_, data=DataConfig(workers=3)))
+    asked: list[int] = []
+    monkeypatch.setattr(
+        "asca_pillars.data.insertion.insert_objects.prepare_database",
+        lambda *args, workers, **more: asked.append(workers) or prepare_database(*args, **more),
+    )
+    open_inserter(KittiSplit(root, "train"), dataclasses.replace(config("gt_aug"), data=DataConfig(workers=3)))
     assert asked == [3]
 
 
 def test_prepare_leaves_nothing_for_training_to_compute(
     root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    path = tmp_path / "model.yaml"
+    path, folder = tmp_path / "model.yaml", tmp_path / "prepared"
     path.write_text("augment: {insert: {method: rs_aug}}")
-    overrides = [f"data.prepared={tmp_path / 'prepared'}"]
-    prepare(path, data=root, override=overrides, workers=1)
+    prepare(path, data=root, override=[f"data.prepared={folder}"], workers=1)
     assert f"{4 * FRAMES} objects of {FRAMES} frames" in capsys.readouterr().out
-    made = {file: file.stat().st_mtime_ns for file in (tmp_path / "prepared").rglob("*.n*")}
+    made = {file: file.stat().st_mtime_ns for file in folder.rglob("*.n*")}
     assert len(made) == FRAMES + 2
-    find = "asca_pillars.data.insertion.free_space.find_free_space"
-    monkeypatch.setattr(find, lambda _: pytest.fail("computed again"))
-    monkeypatch.setattr("asca_pillars.data.insertion.gt_database._build", lambda *_: pytest.fail("built again"))
-    settings_ = config("rs_aug")
-    settings_ = dataclasses.replace(
-        settings_, data=dataclasses.replace(settings_.data, prepared=str(tmp_path / "prepared"))
-    )
-    frames = open_dataset(root, settings_, training=True)
+    for name in ("free_space.find_free_space", "gt_database._build"):
+        monkeypatch.setattr(f"asca_pillars.data.insertion.{name}", lambda *_: pytest.fail("again"))
+    frames = open_dataset(root, prepared_in(folder, config("rs_aug")), training=True)
     assert all(len(frames.sample(0, number).frame.boxes) for number in range(FRAMES))
     assert {file: file.stat().st_mtime_ns for file in made} == made
+
+
+# --- scans in the vehicle's frame
+
+
+def write_boxes(street: Path, root: Path, sensor_m: tuple[float, float, float]) -> Path:
+    """The same street without a camera, in a frame in which the sensor stands there."""
+    split, lines = KittiSplit(street, "train"), []
+    for frame_id in split.frame_ids:
+        frame = read_frame(split, frame_id, TYPES, camera_view=False)
+        points, boxes = frame.points, np.array(frame.boxes, np.float64)
+        points[:, :3] = np.round(points[:, :3] * 512) / 512 + sensor_m  # rounded, so that moving them rounds nothing
+        boxes[:, :6] = np.round(boxes[:, :6] * 512) / 512
+        boxes[:, :3] += sensor_m
+        write_scan(root / "scans" / f"{frame_id}.bin", points)
+        lines.append(json_line(f"{frame_id}.bin", records_from(boxes, [TYPES[label] for label in frame.labels])))
+    (root / "labels.jsonl").write_text("".join(lines))
+    (root / "dataset.yaml").write_text(f"sensor_position: {list(sensor_m)}\n")
+    write_image_set(root, "train", split.frame_ids)
+    return root
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_what_hides_what_is_seen_from_the_sensor(root: Path, tmp_path: Path, method: str) -> None:
+    """In a vehicle's frame, as Argoverse 2's and Waymo's are, the origin is on the ground."""
+    sensor_m, grown = (1.5, 0.25, 1.75), []
+    for name, position in (("sensor", (0.0, 0.0, 0.0)), ("vehicle", sensor_m)):
+        split = BoxSplit(write_boxes(root, tmp_path / name, position), "train")
+        inserter = open_inserter(split, config(method, objects=6))
+        inserter = dataclasses.replace(inserter, ranges=SPEC.ranges.shifted(position))
+        frames = [read_frame(split, frame_id, TYPES) for frame_id in split.frame_ids]
+        grown.append([insert_objects(frame, inserter, np.random.default_rng(0)) for frame in frames])
+        assert sum(len(after.boxes) - len(before.boxes) for after, before in zip(grown[-1], frames, strict=True)) > 6
+    for own, other in zip(*grown, strict=True):
+        np.testing.assert_array_equal(other.labels, own.labels)
+        for moved, still in ((other.points, own.points), (other.boxes, own.boxes)):
+            assert len(moved) == len(still)
+            np.testing.assert_allclose(moved[:, :3] - np.array(sensor_m, np.float32), still[:, :3], atol=1e-4)

@@ -7,8 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from asca_pillars.config.pillar import PillarModel
-from asca_pillars.config.tree import Config, DataConfig
+from asca_pillars.config.tree import DataConfig
 from asca_pillars.data.boxes.box_records import json_line, read_frames, records_from
 from asca_pillars.data.inspection.box_conventions import (
     CONVENTIONS,
@@ -71,14 +70,12 @@ def test_right_labels_pass_and_wrong_ones_are_told(frames: str, request: pytest.
 def test_the_counts_are_those_of_the_changed_boxes(scenes: list[tuple[np.ndarray, np.ndarray]]) -> None:
     points, boxes = scenes[0]
     counts = count_points(points, boxes)
-    np.testing.assert_array_equal(counts[0], points_in_boxes(points, boxes).sum(axis=0))
-    for name, wrong in WRONG.items():
-        row = [convention.name for convention in CONVENTIONS].index(name)
-        undone = wrong(boxes.astype(np.float64)).astype(np.float32)  # each but a shift undoes itself
-        if "height" not in name:
-            np.testing.assert_array_equal(counts[row], points_in_boxes(points, undone).sum(axis=0))
-    raised = boxes + boxes[:, [5]] * np.array([0, 0, 0.5, 0, 0, 0, 0], np.float32)
-    np.testing.assert_array_equal(counts[4], points_in_boxes(points, raised).sum(axis=0))
+    changes = {"as labelled": boxes} | {name: wrong(boxes.astype(np.float64)) for name, wrong in WRONG.items()}
+    lowered, raised = "lowered by half a height", "raised by half a height"
+    changes[lowered], changes[raised] = changes[raised], changes[lowered]  # each but a shift undoes itself
+    for convention, row in zip(CONVENTIONS, counts, strict=True):
+        changed = changes[convention.name].astype(np.float32)
+        np.testing.assert_array_equal(row, points_in_boxes(points, changed).sum(axis=0), err_msg=convention.name)
     assert count_points(points, boxes[:0]).shape == (6, 0)
     assert better_convention(convention_fits(np.zeros((6, 0), np.int64))) is None
 
@@ -86,15 +83,13 @@ def test_the_counts_are_those_of_the_changed_boxes(scenes: list[tuple[np.ndarray
 def test_boxes_that_say_nothing_are_not_doubted() -> None:
     """Square boxes and objects without points fit every yaw alike."""
     rng = np.random.default_rng(0)
-    frames = []
-    for _ in range(20):
-        boxes = np.column_stack(
-            [rng.uniform(5, 40, (8, 2)), np.zeros(8), np.full((8, 2), 0.7), np.full(8, 1.8), rng.uniform(-3, 3, 8)]
-        ).astype(np.float32)
-        near = boxes[:, None, :3] + rng.uniform(-0.3, 0.3, (8, 20, 3)) * [1, 1, 3]
-        frames.append((near.reshape(-1, 3).astype(np.float32), boxes))
+    boxes = np.zeros((20, 8, 7), np.float32)
+    boxes[..., :2], boxes[..., 3:6] = rng.uniform(5, 40, (20, 8, 2)), (0.7, 0.7, 1.8)
+    boxes[..., 6] = rng.uniform(-3, 3, (20, 8))
+    near = boxes[:, :, None, :3] + rng.uniform(-0.3, 0.3, (20, 8, 20, 3)) * [1, 1, 3]
+    frames = list(zip(near.reshape(20, -1, 3).astype(np.float32), boxes, strict=True))
     assert name_of(frames, lambda boxes: boxes) is None
-    assert name_of([(points[:0], boxes) for points, boxes in frames], lambda boxes: boxes) is None
+    assert name_of([(points[:0], own) for points, own in frames], lambda boxes: boxes) is None
 
 
 def rewritten(root: Path, change: Callable[[np.ndarray], np.ndarray]) -> Path:
@@ -121,9 +116,7 @@ def whole(boxes: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("change", [whole, lambda boxes: boxes])
 def test_whole_yaws_are_doubted(change: Callable[[np.ndarray], np.ndarray], tmp_path: Path) -> None:
-    root = rewritten(tmp_path / "data", change)
-    config = Config(model=PillarModel(spec=SPEC), data=DataConfig(workers=0))
-    inspection = inspect_dataset(open_split(root), SPEC, config.data)
+    split = open_split(rewritten(tmp_path / "data", change))
+    inspection = inspect_dataset(split, SPEC, DataConfig(workers=0))
     texts = [item.text for item in findings(inspection, SPEC, 1) if "whole numbers" in item.text]
-    assert len(texts) == (1 if change is whole else 0)
-    assert all("radians are wanted" in text and "pi / 180" in text for text in texts)
+    assert ["radians are wanted" in text and "pi / 180" in text for text in texts] == [True] * (change is whole)

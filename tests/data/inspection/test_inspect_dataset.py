@@ -1,7 +1,7 @@
 """What `asca inspect` measures, against plain loops and the training loader; and what it says of data gone wrong."""
 
 import dataclasses
-import math
+import json
 import re
 import subprocess
 import sys
@@ -14,12 +14,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from asca_pillars.base.schema import to_dict
-from asca_pillars.config.pillar import PillarModel
+from asca_pillars.cli.inspect import inspect
+from asca_pillars.config.pillar import LossConfig, PillarModel
 from asca_pillars.config.tree import Config, pillar_spec
 from asca_pillars.data.frames import LabeledFrame
 from asca_pillars.data.inspection.measurements import MatchOutcome, match, measure_frame, measure_scan
 from asca_pillars.data.kitti import KittiSplit, read_labels
 from asca_pillars.detection.anchors import IGNORED
+from asca_pillars.detection.targets import Assigner, assign_targets
+from asca_pillars.geometry.boxes import points_in_boxes
 from asca_pillars.geometry.overlap import aligned_bev_iou
 from asca_pillars.ops.pillar.prepare import PillarLimits
 from asca_pillars.scans.scan_reader import read_scan
@@ -27,7 +30,6 @@ from asca_pillars.training.dataset import open_dataset
 from tests.data.inspection.conftest import FRAMES
 from tests.data.inspection.inspected_data import (
     CONFIG,
-    Points,
     change_files,
     change_scans,
     found,
@@ -37,13 +39,7 @@ from tests.data.inspection.inspected_data import (
     with_grid,
 )
 from tests.helpers.scenes import GRID, SIZES, SPEC, make_scene
-
-
-def raise_sensor(root: Path, height_m: float) -> None:
-    """Everything lies lower in the LiDAR's frame, the camera's frame stays where it was."""
-    change_scans(root, lambda points: np.subtract(points[:, 2], height_m, out=points[:, 2]))
-    # CALIBRATION: y of the camera is -z of the LiDAR - 0.08 m.
-    change_files(root, "calib", lambda text: text.replace(f"{-0.08:.12e}", f"{-0.08 - height_m:.12e}"))
+from tests.models.pv_rcnn import tiny_pv_rcnn
 
 
 def test_clean_data_gives_nothing_to_warn_of(clean: Path) -> None:
@@ -65,33 +61,52 @@ def test_counts_sizes_and_points_of_a_class_by_plain_loops(clean: Path) -> None:
     assert inspection.frames_without_objects == 0 and not inspection.sampled
 
 
-def test_points_of_a_box_by_a_plain_loop(clean: Path) -> None:
+def test_points_of_a_box_are_those_in_it(clean: Path) -> None:
     split = KittiSplit(clean)
     measure = measure_frame(split, "000000", pillar_spec(CONFIG), CONFIG.data)
-    counts = [0] * len(measure.boxes)
-    for x, y, z, _ in read_scan(split.scan_path("000000")).points.tolist():  # the camera sees all of the boxes
-        for row, (bx, by, bz, length, width, height, yaw) in enumerate(measure.boxes.tolist()):
-            along = math.cos(yaw) * (x - bx) + math.sin(yaw) * (y - by)
-            across = math.cos(yaw) * (y - by) - math.sin(yaw) * (x - bx)
-            counts[row] += abs(along) <= length / 2 and abs(across) <= width / 2 and abs(z - bz) <= height / 2
+    points = read_scan(split.scan_path("000000")).points  # the camera sees all of the boxes
+    counts = points_in_boxes(points, measure.boxes).sum(axis=0).tolist()
     assert measure.points.tolist() == counts and min(counts) > 20
     assert measure.labels.tolist() == [0, 0, 1, 2]
 
 
-def test_positives_are_those_of_the_training_loader(clean: Path) -> None:
-    config = with_data(min_points=110)  # some objects are to be ignored
-    one_zone = dataclasses.replace(SPEC, grid=dataclasses.replace(GRID, zones=1))
-    config = dataclasses.replace(config, model=PillarModel(spec=one_zone))
-    samples = [open_dataset(clean, config, training=False).sample(0, number) for number in range(FRAMES)]
-    inspection = inspected(clean, config)
-    for index, facts in enumerate(inspection.classes):
-        states = [sample.prepared.targets.state[..., 2 * index : 2 * index + 2] for sample in samples]
-        assert facts.positives == sum((state == 1).sum() for state in states) > 0
-        to_find = sum((sample.frame.labels == index).sum() for sample in samples)
-        assert facts.overlapped + facts.forced + facts.missed == to_find < facts.boxes
-        assert facts.few_points == facts.boxes - to_find
-    points = [sample.prepared.pillars.stats.points for sample in samples]
-    assert inspection.scans.points.largest == max(points)
+ONE_ZONE = PillarModel(spec=dataclasses.replace(SPEC, grid=dataclasses.replace(GRID, zones=1)))
+WITHOUT_THRESHOLDS = PillarModel(spec=SPEC, loss=LossConfig(assigner="atss"))
+
+
+@pytest.mark.parametrize(
+    "config",
+    [
+        dataclasses.replace(with_data(min_points=110), model=ONE_ZONE),  # some objects are ignored
+        dataclasses.replace(CONFIG, model=WITHOUT_THRESHOLDS),
+        dataclasses.replace(CONFIG, model=tiny_pv_rcnn.MODEL),
+    ],
+    ids=["pillars", "without thresholds", "voxels"],
+)
+def test_the_command_counts_the_positives_of_the_training_loader(clean: Path, tmp_path: Path, config: Config) -> None:
+    path, report = tmp_path / "config.yaml", tmp_path / "report.json"
+    path.write_text(yaml.safe_dump(to_dict(config)))
+    inspect(clean, config=path, json=report)
+    frames = open_dataset(clean, config, training=False)
+    samples = [frames.sample(0, number) for number in range(FRAMES)]
+    states = np.stack([sample.prepared.targets.state for sample in samples])
+    labels = np.concatenate([sample.frame.labels for sample in samples])
+    written = json.loads(report.read_text())
+    for index, facts in enumerate(written["classes"]):
+        assert facts["positives"] == (states[..., 2 * index : 2 * index + 2] == 1).sum() > 0
+        to_find = facts["overlapped"] + facts["forced"] + facts["missed"]
+        assert to_find == (labels == index).sum() == facts["boxes"] - facts["few_points"]
+        assert (facts["few_points"] > 0) == (config.data.min_points > 1)
+        assert facts["forced"] == 0 or config.model != WITHOUT_THRESHOLDS
+    assert written["scans"]["points"][-1] == max(len(sample.frame.points) for sample in samples)
+
+
+def outcomes_of(
+    boxes: list[list[float]], labels: list[int], assigner: Assigner = "overlap"
+) -> tuple[list[int], np.ndarray]:
+    frame = LabeledFrame("0", np.empty((0, 4), np.float32), np.array(boxes, np.float32), np.array(labels))
+    outcomes, positives = match(frame, SPEC, assigner)
+    return outcomes.tolist(), positives
 
 
 @settings(max_examples=30)
@@ -100,13 +115,11 @@ def test_an_objects_outcome_by_its_overlap_with_every_anchor(
     label: int, x: float, y: float, stretch: float, yaw: float
 ) -> None:
     length, width, height = SIZES[SPEC.class_names[label]]
-    box = np.array([[x, y, -0.9, length * stretch, width, height, yaw]], np.float32)
-    outcomes, positives = match(LabeledFrame("0", np.empty((0, 4), np.float32), box, np.array([label])), SPEC)
+    box = [x, y, -0.9, length * stretch, width, height, yaw]
+    outcomes, positives = outcomes_of([box], [label])
     own = SPEC.anchors[:, :, 2 * label : 2 * label + 2].reshape(-1, 7)
-    best = aligned_bev_iou(own, box).max()
-    assert outcomes.tolist() == [
-        MatchOutcome.OVERLAPPED if best >= SPEC.classes[label].positive_iou else MatchOutcome.FORCED
-    ]
+    reached = aligned_bev_iou(own, np.array([box], np.float32)).max() >= SPEC.classes[label].positive_iou
+    assert outcomes == [MatchOutcome.OVERLAPPED if reached else MatchOutcome.FORCED]
     assert positives[label] >= 1 and positives.sum() == positives[label]
 
 
@@ -116,21 +129,14 @@ def test_outcomes_by_hand() -> None:
     short = [x, y + 5, -1.0, 2.0, 1.6, 1.56, 0.0]  # overlap at most 2.0 / 3.9 = 0.51
     person = [x + 6, y, -0.6, 0.8, 0.6, 1.73, 0.0]
     beside = [4.79, y, -1.0, 3.9, 1.6, 1.56, 0.0]
-    boxes = np.array([car, short, person, person, beside, car], np.float32)
-    labels = np.array([0, 0, 1, 1, 0, IGNORED])
-    outcomes, positives = match(LabeledFrame("0", np.empty((0, 4), np.float32), boxes, labels), SPEC)
+    outcomes, positives = outcomes_of([car, short, person, person, beside, car], [0, 0, 1, 1, 0, IGNORED])
     # Of two equal boxes the later has the best anchors, the earlier what else reaches positive_iou.
-    assert outcomes[[0, 1, 3, 4, 5]].tolist() == [
-        MatchOutcome.OVERLAPPED,
-        MatchOutcome.FORCED,
-        MatchOutcome.OVERLAPPED,
-        MatchOutcome.LEFT_OUT,
-        MatchOutcome.LEFT_OUT,
+    assert [outcomes[row] for row in (0, 1, 3)] == [
+        *(MatchOutcome.OVERLAPPED, MatchOutcome.FORCED, MatchOutcome.OVERLAPPED)
     ]
-    assert positives[2] == 0
-    tiny = np.array([[x, y, -0.6, 0.3, 0.3, 1.7, 0.0]] * 2, np.float32)
-    outcomes, _ = match(LabeledFrame("0", np.empty((0, 4), np.float32), tiny, np.array([1, 1])), SPEC)
-    assert outcomes.tolist() == [MatchOutcome.MISSED, MatchOutcome.FORCED]
+    assert outcomes[4:] == [MatchOutcome.LEFT_OUT] * 2 and positives[2] == 0
+    tiny = [[x, y, -0.6, 0.3, 0.3, 1.7, 0.0]] * 2
+    assert outcomes_of(tiny, [1, 1])[0] == [MatchOutcome.MISSED, MatchOutcome.FORCED]
 
 
 def test_pillars_before_the_limits_agree_with_what_pillarize_drops(clean: Path) -> None:
@@ -159,7 +165,10 @@ def test_evenly_spaced_frames(clean: Path) -> None:
 
 @pytest.mark.parametrize("height_m", [-1.73, 1.0])
 def test_another_sensor_height_and_its_remedy(data: Path, height_m: float) -> None:
-    raise_sensor(data, height_m)
+    """Everything lies lower in the LiDAR's frame, the camera's frame stays where it was."""
+    change_scans(data, lambda points: np.subtract(points[:, 2], height_m, out=points[:, 2]))
+    # CALIBRATION: y of the camera is -z of the LiDAR - 0.08 m.
+    change_files(data, "calib", lambda text: text.replace(f"{-0.08:.12e}", f"{-0.08 - height_m:.12e}"))
     warnings = found(data)
     assert {warning.about for warning in warnings} == {"Car", "Pedestrian", "Cyclist", "height"}
     (ground,) = [warning.text for warning in warnings if warning.about == "height"]
@@ -182,17 +191,10 @@ def test_scans_that_were_raised_without_their_labels(data: Path) -> None:
 @pytest.mark.parametrize(
     ("config", "about", "message"),
     [
-        (
-            with_grid(x_range_m=(4.8, 15.04)),
-            "Car",
-            r"\d+ % in x and 0 % in y, .* model.spec.grid.x_range_m \[4.8",
-        ),
-        (
-            with_grid(y_range_m=(-1.28, 7.68)),
-            "Car",
-            r"0 % in x and \d+ % in y, .* model.spec.grid.y_range_m \[-1",
-        ),
+        (with_grid(x_range_m=(4.8, 15.04)), "Car", r"\d+ % in x and 0 % in y, .* model.spec.grid.x_range_m \[4.8"),
+        (with_grid(y_range_m=(-1.28, 7.68)), "Car", r"0 % in x and \d+ % in y, .* model.spec.grid.y_range_m \[-1"),
         (with_grid(z_range_m=(-1.0, 1.0)), "Car", r"100 % of the boxes reach beyond model.spec.grid.z_range_m \[-1"),
+        (with_grid(v_max_m=1.28, v_y_m=1.76), "Pedestrian", "make model.spec.grid.v_max_m and v_y_m smaller"),
         (with_data(min_points=110), "Car", r"fewer points than data.min_points = 110 and are ignored; lower it"),
         (with_detector(limits=PillarLimits(500, 24)), "points", r"100 % of the scans have more pillars .* raise it to"),
         (with_detector(limits=PillarLimits(9000, 1)), "points", r"max_points = 1 takes away \d+ % of the points"),
@@ -214,16 +216,8 @@ def test_anchors_of_another_size(clean: Path) -> None:
     assert inspected(clean, config).classes[0].misfits == 2 * FRAMES
 
 
-def test_anchors_too_far_apart(clean: Path) -> None:
-    (warning, *_) = [item for item in found(clean, with_grid(v_max_m=1.28, v_y_m=1.76)) if item.about == "Pedestrian"]
-    assert "make model.spec.grid.v_max_m and v_y_m smaller" in warning.text
-
-
 def test_points_that_are_not_numbers_and_scans_that_see_nothing(data: Path) -> None:
-    def spoil(points: Points) -> None:
-        points[:5, 1] = np.nan
-
-    change_scans(data, spoil, every=6)
+    change_scans(data, lambda points: points.__setitem__((slice(5), 1), np.nan), every=6)
     (warning,) = found(data)
     assert warning.text.startswith("points with a value that is not finite: 10, in 2 of 12 scans; ")
     change_scans(data, lambda points: np.multiply(points[:, 0], -1, out=points[:, 0]), every=12)
@@ -253,10 +247,45 @@ def test_runs_without_torch(clean: Path, tmp_path: Path) -> None:
 
 def test_axes_of_a_layout_that_cannot_state_them(data: Path) -> None:
     """A dataset.yaml would make another layout of it."""
+    change_scans(data, lambda points: np.multiply(points[:, 1:3], -1, out=points[:, 1:3]))
+    (text,) = [item.text for item in found(data) if "scans are odd" in item.text]
+    assert text.endswith("turn the points of all scans to x forward, y left, z up, and calib with them")
 
-    def turn_upside_down(points: Points) -> None:
-        points[:, 1:3] *= -1
 
-    change_scans(data, turn_upside_down)
-    texts = [item.text for item in found(data) if "scans are odd" in item.text]
-    assert texts and texts[0].endswith("turn the points of all scans to x forward, y left, z up, and calib with them")
+# --- reflectances: of those that reading changes, and only of them
+
+
+@pytest.mark.parametrize(
+    ("scale", "every", "message"),
+    [
+        (255, 1, r"divided by 255 when read: training sees 0 to 0\.\d+; divide it by its full scale"),
+        (100, 1, r"training sees 0 to 0\.3\d; divide it by its full scale"),
+        (255, 2, r"in 6 of 12 scans, which are divided by 255; .* store all of them as 0\.\.1"),
+        (65535, 1, r"divided by 65535 when read: training sees 0 to 0\.\d+; divide it by its full scale"),
+        (65535, 2, r"in 6 of 12 scans, which are divided by 65535; the others are taken as 0\.\.1"),
+        (1.5, 1, r"cut off at 1 in \d+\.\d % of the points; divide it by its full scale"),
+        (0, 1, r"0 everywhere; check what exported"),
+        (1 / 255, 1, r"reaches 0\.00\d+ only; store it as 0\.\.1"),
+        (-1, 1, r"goes down to -0\.\d+ and is cut off at 0"),
+    ],
+)
+def test_reflectance_on_another_scale(data: Path, scale: float, every: int, message: str) -> None:
+    change_scans(data, lambda points: np.multiply(points[:, 3], scale, out=points[:, 3]), every)
+    finding = found(data)[0]
+    assert finding.level == "warning" and finding.about == "reflectance" and re.search(message, finding.text)
+
+
+@pytest.mark.parametrize("speck", [1.02, 40.0, 300.0])
+def test_a_speck_of_reflectance_is_none_that_reading_minds(data: Path, speck: float) -> None:
+    change_scans(data, lambda points: points.__setitem__((0, 3), speck), every=4)
+    assert found(data) == []
+
+
+def test_outcomes_by_hand_without_thresholds() -> None:
+    """A short car, which no anchor overlaps by positive_iou, and tiny boxes that have the same best anchors."""
+    x, y = SPEC.anchors[20, 15, 0, :2]
+    boxes, labels = [[x, y, -1.0, 2.0, 1.6, 1.56, 0.0]] + [[x, y + 5, -0.6, 0.3, 0.3, 1.7, 0.0]] * 2, [0, 1, 1]
+    outcomes, positives = outcomes_of(boxes, labels, "atss")
+    assert outcomes == [MatchOutcome.OVERLAPPED, MatchOutcome.MISSED, MatchOutcome.OVERLAPPED]
+    targets = assign_targets(SPEC.anchors, SPEC.classes, np.array(boxes, np.float32), np.array(labels), "atss")
+    assert positives.tolist() == np.bincount(np.array(labels)[targets.matched], minlength=3).tolist()

@@ -76,8 +76,7 @@ def test_a_class_missing_in_a_sample_may_be_in_the_rest(data: Path) -> None:
     for frame_id in ("000000", "000006"):
         path = KittiSplit(data).label_path(frame_id)
         path.write_text(re.sub("Cyclist.*\n", "", path.read_text()))
-    inspection = inspected(data, CONFIG, frames=2)
-    (first, *_) = findings(inspection, pillar_spec(CONFIG), CONFIG.data.min_points)
+    (first, *_) = findings(inspected(data, CONFIG, frames=2), pillar_spec(CONFIG), CONFIG.data.min_points)
     assert "look at all frames with --frames 12" in first.text
 
 
@@ -89,25 +88,18 @@ def test_missing_files_are_named_though_their_frames_were_not_chosen(data: Path)
         inspected(data, CONFIG, frames=1)
 
 
-def test_a_json_that_cannot_be_written_is_told_before_the_work(
-    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(
-        "asca_pillars.data.inspection.inspect_dataset.inspect_dataset", lambda *_, **__: pytest.fail("too late")
-    )
-    with pytest.raises(OutputError, match="is a folder; choose a file's name"):
-        inspect(data, config=Path("asca_sim"), json=tmp_path)
-
-
-def test_json_replaces_its_own_report_alone(data: Path, tmp_path: Path) -> None:
-    (tmp_path / "config.yaml").write_text(yaml.safe_dump(to_dict(CONFIG)))
+def test_json_replaces_its_own_report_alone(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    config, label = tmp_path / "config.yaml", KittiSplit(data).label_path("000000")
+    config.write_text(yaml.safe_dump(to_dict(CONFIG)))
     for _ in range(2):
-        inspect(data, config=tmp_path / "config.yaml", json=tmp_path / "report.json", frames=2)
+        inspect(data, config=config, json=tmp_path / "report.json", frames=2)
     (tmp_path / "other.json").write_text(json.dumps({"config": "mine", "findings": []}))
     (tmp_path / "link.json").symlink_to(tmp_path / "report.json")
-    label = KittiSplit(data).label_path("000000")
-    for path in (tmp_path / "other.json", tmp_path / "config.yaml", label, tmp_path / "link.json"):
-        before = path.read_bytes()
-        with pytest.raises(OutputError, match=f"{path.name}: (`asca inspect --json` did not write it|is a link)"):
-            inspect(data, config=tmp_path / "config.yaml", json=path)
-        assert path.read_bytes() == before
+    work = "asca_pillars.data.inspection.inspect_dataset.inspect_dataset"
+    monkeypatch.setattr(work, lambda *_, **__: pytest.fail("told too late"))
+    for path in (tmp_path / "other.json", config, label, tmp_path / "link.json", tmp_path):
+        before = path.read_bytes() if path.is_file() else b""
+        message = r"`asca inspect --json` did not write it|is a link|is a folder; choose a file's name"
+        with pytest.raises(OutputError, match=f"{path.name}: ({message})"):
+            inspect(data, config=config, json=path)
+        assert before == (path.read_bytes() if path.is_file() else b"")

@@ -7,11 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from typer.testing import CliRunner
 
 from asca_pillars.base.errors import AscaError, DatasetError, OutputError
 from asca_pillars.base.schema import parse
-from asca_pillars.cli.main import app
 from asca_pillars.config.pillar import PillarModel
 from asca_pillars.config.tree import Config, DataConfig, load_config, pillar_spec
 from asca_pillars.data.boxes.box_records import json_line, read_frames, records_from
@@ -25,65 +23,66 @@ from asca_pillars.ops.pillar.spec import PillarSpec
 from asca_pillars.scans.scan_reader import write_scan
 from tests.data.boxes.box_scenes import write_box_dataset
 from tests.data.inspection.sized_boxes import SIZES, write_around
+from tests.helpers.in_process import invoke
 from tests.helpers.scenes import SPEC
+from tests.models.pv_rcnn.tiny_pv_rcnn import tiny_config
 
 CONFIG = Config(model=PillarModel(spec=SPEC), data=DataConfig(workers=0))
 
 
-def test_anchors_have_the_size_of_the_boxes(tmp_path: Path) -> None:
-    split = BoxSplit(write_around(tmp_path, 60, reach_m=30, z_m=0.3))
-    proposal = propose(split, CONFIG)
+def with_grid(grid: PillarGrid) -> Config:
+    return replace(CONFIG, model=PillarModel(spec=PillarSpec(grid=grid)))
+
+
+@pytest.fixture(scope="module")
+def around(tmp_path_factory: pytest.TempPathFactory) -> BoxSplit:
+    return BoxSplit(write_around(tmp_path_factory.mktemp("around"), 60, reach_m=30, z_m=0.3))
+
+
+@pytest.mark.parametrize("config", [CONFIG, tiny_config()], ids=["pillars", "voxels"])
+def test_anchors_and_ranges_are_those_of_the_boxes(around: BoxSplit, config: Config) -> None:
+    proposal = propose(around, config)
+    proposed, spec = proposal.config, proposal.config.model.spec
     assert proposal.boxes == {"Forklift": 60, "Pallet": 60}
-    for item in proposal.config.model.spec.classes:
+    assert not proposed.data.camera_view  # there is no camera
+    for item in spec.classes:
         size = np.array([item.length_m, item.width_m, item.height_m])
         np.testing.assert_allclose(size, SIZES[item.name], rtol=0.03, atol=0.01)
         assert item.z_m == pytest.approx(0.3 + SIZES[item.name][2] / 2, abs=0.05)
         assert item.negative_iou == pytest.approx(item.positive_iou - 0.15)
-    assert not proposal.config.data.camera_view  # there is no camera
-
-
-def test_the_grid_looks_where_the_boxes_are(tmp_path: Path) -> None:
-    split = BoxSplit(write_around(tmp_path, 60, reach_m=30, z_m=0.3))
-    spec = pillar_spec(propose(split, CONFIG).config)
-    assert spec.grid.zones == 1 and spec.grid.x_range_m[0] == -spec.grid.x_range_m[1]
-    centers = np.concatenate([split.labeled_boxes(frame_id).boxes for frame_id in split.frame_ids])
+    assert spec.ranges.x_m[0] == -spec.ranges.x_m[1]
+    centers = np.concatenate([around.labeled_boxes(frame_id).boxes for frame_id in around.frame_ids])
     assert spec.ranges.hold_centers(centers).mean() >= 0.94
-    assert spec.grid.z_range_m[0] < 0.3 and spec.grid.z_range_m[1] > 2.5
-    inspection = inspect_dataset(split, spec, CONFIG.data)
+    assert spec.ranges.z_m[0] < 0.3 and spec.ranges.z_m[1] > 2.5
+    inspection = inspect_dataset(around, spec, proposed.data)
     assert not [finding for finding in findings(inspection, spec, 1) if finding.level == "error"]
     assert all(facts.forced <= 0.45 * facts.boxes for facts in inspection.classes)
-
-
-def test_a_range_that_holds_the_boxes_stays(tmp_path: Path) -> None:
-    split = BoxSplit(write_box_dataset(tmp_path, 12))
-    proposal = propose(split, CONFIG)
-    assert proposal.config.model.spec.grid == SPEC.grid
-    assert [item.name for item in proposal.config.model.spec.classes] == ["Car", "Forklift"]
+    text = yaml.safe_dump(differences(proposed), sort_keys=False)
+    assert parse(Config, yaml.safe_load(text), "text") == proposed
+    assert ("learning_rate" in text) == (config is not CONFIG)  # what is the default stays out
 
 
 def test_a_range_to_the_sides_that_holds_the_boxes_stays_where_boxes_stand_behind(tmp_path: Path) -> None:
     """A corridor: 20 m ahead and behind, hardly any to the sides."""
-    root = write_around(tmp_path, 40, reach_m=20)
-    lines = []
-    for number, (_, records, *_) in enumerate(read_frames(root / "labels.jsonl")):
+    root, lines = write_around(tmp_path, 40, reach_m=20), []
+    for name, records, *_ in read_frames(root / "labels.jsonl"):
         boxes = records.boxes * [1, 0.2, 1, 1, 1, 1, 1]
-        lines.append(json_line(f"{number}.bin", records_from(boxes, records.types)))
-        points = np.column_stack([np.repeat(boxes[:, :3], 20, axis=0), np.full(40, 0.5)])
-        write_scan(root / "scans" / f"{number}.bin", points)
+        lines.append(json_line(name, records_from(boxes, records.types)))
+        write_scan(root / "scans" / name, np.insert(np.repeat(boxes[:, :3], 20, axis=0), 3, 0.5, axis=1))
     (root / "labels.jsonl").write_text("".join(lines))
     wide = PillarGrid(x_range_m=(4.8, 15.04), y_range_m=(-15.36, 15.36), v_max_m=0.32, zones=2)
-    config = replace(CONFIG, model=PillarModel(spec=PillarSpec(grid=wide)))
-    grid = pillar_spec(propose(BoxSplit(root), config).config).grid
+    grid = pillar_spec(propose(BoxSplit(root), with_grid(wide)).config).grid
     assert grid.x_range_m[0] == -grid.x_range_m[1] and grid.x_range_m[1] > 15
     assert grid.y_range_m == wide.y_range_m
 
 
-def test_a_range_ahead_is_widened_to_legal_ones(tmp_path: Path) -> None:
+def test_a_range_ahead_is_widened_to_legal_ones_and_stays_where_it_holds_the_boxes(tmp_path: Path) -> None:
     narrow = PillarGrid(x_range_m=(4.8, 15.04), y_range_m=(-2.56, 2.56), v_max_m=0.32, zones=2)
-    config = replace(CONFIG, model=PillarModel(spec=PillarSpec(grid=narrow)))
     split = BoxSplit(write_box_dataset(tmp_path, 12))
-    grid = pillar_spec(propose(split, config).config).grid
+    grid = pillar_spec(propose(split, with_grid(narrow)).config).grid
     assert grid.zones == 2 and grid.x_range_m[1] > 20 and grid.y_range_m == (-grid.y_range_m[1], grid.y_range_m[1])
+    spec = propose(split, CONFIG).config.model.spec
+    assert spec.grid == SPEC.grid and spec.class_names == ("Car", "Forklift")
 
 
 def test_pillars_get_room(tmp_path: Path) -> None:
@@ -103,39 +102,23 @@ def test_a_type_with_few_boxes_is_no_class(tmp_path: Path) -> None:
         propose(split, CONFIG)
 
 
-def test_the_yaml_gives_the_same_configuration(tmp_path: Path) -> None:
-    proposed = propose(BoxSplit(write_around(tmp_path, 20, reach_m=30)), CONFIG).config
-    text = yaml.safe_dump(differences(proposed), sort_keys=False)
-    assert parse(Config, yaml.safe_load(text), "text") == proposed
-    assert "learning_rate" not in text  # what is the default stays out
-
-
 def test_the_command_writes_what_it_then_inspects(tmp_path: Path) -> None:
     root, path = write_around(tmp_path / "own", 20, reach_m=30), tmp_path / "own.yaml"
-    arguments = ["inspect", str(root), "-c", "asca_small_sim", "--propose", str(path)]
-    result = CliRunner().invoke(app, arguments, catch_exceptions=False)
-    assert result.exit_code == 0 and f"asca train {path}" in result.output.replace("\n", "")
+    with pytest.raises(AscaError, match="let --propose measure the classes that there are"):
+        invoke("inspect", root, "-c", "asca_small_sim")
+    output = invoke("inspect", root, "-c", "asca_small_sim", "--propose", path)
+    assert f"asca train {path}" in output.replace("\n", "")
     assert load_config(path).model.spec.class_names == ("Forklift", "Pallet")
     with pytest.raises(OutputError, match=r"own\.yaml: is there already"):
-        CliRunner().invoke(app, arguments, catch_exceptions=False)
-
-
-def test_a_class_without_labels_points_to_it(tmp_path: Path) -> None:
-    root = write_around(tmp_path / "own", 20, reach_m=30)
-    with pytest.raises(AscaError, match="let --propose measure the classes that there are"):
-        CliRunner().invoke(app, ["inspect", str(root), "-c", "asca_small_sim"], catch_exceptions=False)
+        invoke("inspect", root, "-c", "asca_small_sim", "--propose", path)
 
 
 def test_boxes_with_hardly_a_point_do_not_widen_the_grid(tmp_path: Path) -> None:
-    root = write_box_dataset(tmp_path, 12)
-    far = np.array([[200.0, 0, -1, 2.5, 1.2, 2, 0]])
-    lines = []
-    for number in range(12):
-        path = root / "scans" / f"{number:06d}.bin"
-        points = np.fromfile(path, "<f4").reshape(-1, 4)
-        np.concatenate([points, [[200, 0, -1, 0.5]]]).astype("<f4").tofile(path)
-        near = BoxSplit(root).labeled_boxes(f"{number:06d}").boxes
-        lines.append(json_line(path.name, records_from(np.concatenate([near, far]), ["Car", "Forklift", "Forklift"])))
-    (root / "labels.jsonl").write_text("".join(lines))
-    proposal = propose(BoxSplit(root), CONFIG)
+    split, far, lines = BoxSplit(write_box_dataset(tmp_path, 12)), [200.0, 0, -1, 2.5, 1.2, 2, 0], []
+    for frame_id in split.frame_ids:
+        write_scan(split.scan_path(frame_id), np.append(split.points(frame_id), [[200, 0, -1, 0.5]], axis=0))
+        boxes = np.append(split.labeled_boxes(frame_id).boxes, [far], axis=0)
+        lines.append(json_line(f"{frame_id}.bin", records_from(boxes, ["Car", "Forklift", "Forklift"])))
+    (tmp_path / "labels.jsonl").write_text("".join(lines))
+    proposal = propose(BoxSplit(tmp_path), CONFIG)
     assert proposal.boxes["Forklift"] == 24 and proposal.config.model.spec.grid == SPEC.grid

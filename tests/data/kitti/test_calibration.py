@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from asca_pillars.base.errors import DatasetError
 from asca_pillars.data.kitti import objects_from_boxes
 from asca_pillars.data.kitti.calibration import (
     image_boxes,
@@ -56,9 +55,8 @@ def test_edges_in_front_connect_the_projected_corners():
     pixels, depth_m = calib.project(corners(boxes))
     assert depth_m.shape == (2, 8)
     ends = project_edges(boxes, calib)
-    np.testing.assert_allclose(ends[:, 0, 0], pixels[:, 0])
-    np.testing.assert_allclose(ends[:, 6], pixels[:, [6, 7]])
-    np.testing.assert_allclose(ends[:, 9], pixels[:, [1, 5]])
+    for edge, ends_of in ((0, [0, 1]), (6, [6, 7]), (9, [1, 5])):
+        np.testing.assert_allclose(ends[:, edge], pixels[:, ends_of])
 
 
 def test_in_image_is_projecting_each_point():
@@ -90,21 +88,11 @@ def test_calibration_round_trip_and_all_seven_lines(tmp_path):
     for name in ("p2", "r0_rect", "camera_from_lidar"):
         np.testing.assert_allclose(getattr(back, name), getattr(calib, name), atol=1e-11)
     lines = [line.split() for line in (tmp_path / "c.txt").read_text().splitlines()]
-    assert [line[0] for line in lines] == [
-        *("P0:", "P1:", "P2:", "P3:", "R0_rect:", "Tr_velo_to_cam:", "Tr_imu_to_velo:")
-    ]
+    assert [line[0] for line in lines[:4]] == ["P0:", "P1:", "P2:", "P3:"]
+    assert [line[0] for line in lines[4:]] == ["R0_rect:", "Tr_velo_to_cam:", "Tr_imu_to_velo:"]
     assert [len(line) - 1 for line in lines] == [12, 12, 12, 12, 9, 12, 12]
     points = np.array([[10.0, 2, -1], [40, -7, 0.5]])
     np.testing.assert_allclose(back.lidar_from_rect(back.rect_from_lidar(points)), points, atol=1e-9)
-
-
-def test_a_projection_that_sees_nothing_is_named(tmp_path):
-    path = tmp_path / "000000.txt"
-    write_calibration(path, make_calibration(1.0, 2.0, -1.0, (0.1, -0.08, -0.27)))
-    lines = path.read_text().splitlines()
-    path.write_text("\n".join("P2: " + "0 " * 12 if line.startswith("P2") else line for line in lines))
-    with pytest.raises(DatasetError, match=r"000000\.txt: P2 is no projection"):
-        read_calibration(path)
 
 
 def test_calibration_in_the_tracking_benchmarks_spelling(tmp_path):
@@ -122,6 +110,7 @@ def test_calibration_in_the_tracking_benchmarks_spelling(tmp_path):
         ("P2: 7.000000000000e+02", "P2:", ["P2", "11", "12"]),
         ("P2: 7.000000000000e+02", "P2: seven", ["P2", "seven"]),
         ("P2: 7.000000000000e+02", "P2: nan", ["P2", "finite"]),
+        ("P2: ", f"P2: {'0 ' * 12}\nP9: ", ["P2 is no projection"]),
         ("R0_rect: 1.000000000000e+00", "R0_rect: 0", ["R0_rect", "rotation"]),
     ],
 )

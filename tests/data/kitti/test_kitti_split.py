@@ -1,14 +1,16 @@
 """The folder layout, and real frames where there are some."""
 
+import hashlib
 import json
 import math
 import os
 import struct
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from asca_pillars.base.errors import DatasetError
+from asca_pillars.base.errors import DatasetError, OutputError, ScanError
 from asca_pillars.data.kitti import (
     DEFAULT_IMAGE_SIZE_WH,
     KittiSplit,
@@ -19,8 +21,10 @@ from asca_pillars.data.kitti import (
     write_image_set,
     write_labels,
 )
+from asca_pillars.data.kitti.kitti_split import train_val_frames, write_train_val_lists
 from asca_pillars.scans.scan_reader import read_scan
 from tests.helpers.cameras import assert_one_line
+from tests.helpers.in_process import invoke
 
 BOX_FIELDS = ("height_m", "width_m", "length_m", "x_m", "y_m", "z_m", "rotation_y")
 
@@ -35,6 +39,9 @@ def root(tmp_path):
 
 
 def test_splits(root):
+    """Hidden files are of a killed writer, or of macOS; Notepad begins a list with a byte-order mark."""
+    for name in (".000001.asca-12345678.bin", "._000002.bin"):
+        (root / "training/velodyne" / name).write_bytes(bytes(16))
     write_image_set(root, "val", ["000010", "000001"])
     write_image_set(root, "test", ["000007"])
     assert KittiSplit(root).frame_ids == ("000001", "000002", "000010")
@@ -42,30 +49,25 @@ def test_splits(root):
     assert KittiSplit(root, "testing").frame_ids == KittiSplit(root, "test").frame_ids == ("000007",)
     assert KittiSplit(root, "val").scan_path("000010") == root / "training/velodyne/000010.bin"
     assert KittiSplit(root, "test").calib_path("000007") == root / "testing/calib/000007.txt"
-
-
-def test_hidden_files_are_no_frames_and_a_byte_order_mark_no_part_of_a_name(root):
-    """Left by a killed writer, or by macOS; Notepad begins a list with the mark."""
-    for name in (".000001.asca-12345678.bin", "._000002.bin"):
-        (root / "training/velodyne" / name).write_bytes(bytes(16))
-    assert KittiSplit(root).frame_ids == ("000001", "000002", "000010")
-    write_image_set(root, "val", ["000001"])
     (root / "ImageSets/val.txt").write_text("000001\n", encoding="utf-8-sig")
     assert KittiSplit(root, "val").frame_ids == ("000001",)
 
 
-def test_missing_parts_of_a_dataset_are_named(root, tmp_path):
-    split = KittiSplit(root)
-    assert_one_line(root / "training/label_2/000001.txt", ["empty file"], lambda: split.objects("000001"))
-    assert_one_line(root / "training/calib/000001.txt", ["calib"], lambda: split.calibration("000001"))
+def test_missing_parts_of_a_dataset_are_named(root):
+    split, nowhere = KittiSplit(root), root / "nowhere"
     write_image_set(root, "val", ["000001", "000003", "000004"])
-    write_image_set(root, "none", [])
-    missing = root / "training/velodyne/000003.bin"
-    assert_one_line(missing, ["2 of 3", "val.txt"], lambda: KittiSplit(root, "val").frame_ids)
-    assert_one_line("none.txt", ["empty"], lambda: KittiSplit(root, "none").frame_ids)
-    assert_one_line("vall.txt", ["none, val", "--split training"], lambda: KittiSplit(root, "vall").frame_ids)
-    nowhere = root / "nowhere"
-    assert_one_line(nowhere / "training/velodyne", ["<root>"], lambda: KittiSplit(nowhere).frame_ids)
+    for name, content in (("none", b""), ("bytes", b"000001\n\xff\xfe\n")):
+        (root / "ImageSets" / f"{name}.txt").write_bytes(content)
+    for place, words, action in (
+        (root / "training/label_2/000001.txt", ["empty file"], lambda: split.objects("000001")),
+        (root / "training/calib/000001.txt", ["calib"], lambda: split.calibration("000001")),
+        (root / "training/velodyne/000003.bin", ["2 of 3", "val.txt"], lambda: KittiSplit(root, "val").frame_ids),
+        ("none.txt", ["empty"], lambda: KittiSplit(root, "none").frame_ids),
+        ("bytes.txt", ["not UTF-8"], lambda: KittiSplit(root, "bytes").frame_ids),
+        ("vall.txt", ["bytes, none, val", "--split training"], lambda: KittiSplit(root, "vall").frame_ids),
+        (nowhere / "training/velodyne", ["<root>"], lambda: KittiSplit(nowhere).frame_ids),
+    ):
+        assert_one_line(place, words, action)
 
 
 def test_scans_of_five_columns_are_stored_as_they_are_read(root):
@@ -98,12 +100,6 @@ def test_labels_stand_all_around_where_the_simulator_says_so(root):
     (root / "simulation.json").write_text("{")
     with pytest.raises(DatasetError, match=r"simulation\.json"):
         _ = KittiSplit(root).has_camera
-
-
-def test_a_list_that_is_not_text_is_named(root):
-    write_image_set(root, "val", [])
-    (root / "ImageSets" / "val.txt").write_bytes(b"000001\n\xff\xfe\n")
-    assert_one_line("val.txt", ["not UTF-8"], lambda: KittiSplit(root, "val").frame_ids)
 
 
 # --- real frames, where there are some
@@ -141,3 +137,62 @@ def test_real_scans_are_read_whole(kitti_mini):
     assert 0.5 < scan.points[:, 3].max() <= 1
     seen = in_image(scan.points, kitti_mini.calibration(frame_id), kitti_mini.image_size_wh(frame_id))
     assert 0.1 < seen.mean() < 0.25
+
+
+# --- KITTI's two lists: as the toolboxes carry them, to the last byte
+
+
+# SHA-256 of OpenPCDet's data/kitti/ImageSets/train.txt and val.txt.
+DIGESTS = {
+    "train": "e85ce0142be11c7e4196fd7b79a8bc8c2cefdd6fe754ac61fef8d421e37aba5c",
+    "val": "6e2394d97c866c3af1ffb049f828abdf3d5b707d9575d16885fd0de87b72b0c8",
+}
+
+
+@pytest.fixture(scope="module")
+def frames(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("kitti") / "velodyne"
+    folder.mkdir()
+    for number in range(7481):
+        (folder / f"{number:06d}.bin").touch()
+    return folder
+
+
+@pytest.fixture
+def kitti(frames: Path, tmp_path: Path) -> Path:
+    (tmp_path / "training").symlink_to(frames.parent)
+    return tmp_path
+
+
+def test_the_lists_are_the_published_ones(kitti: Path) -> None:
+    lists = train_val_frames()
+    assert [len(lists[name]) for name in ("train", "val")] == [3712, 3769]
+    assert sorted(lists["train"] + lists["val"]) == [f"{number:06d}" for number in range(7481)]
+    written = write_train_val_lists(kitti)
+    assert {path.stem: hashlib.sha256(path.read_bytes()).hexdigest() for path in written} == DIGESTS
+    assert KittiSplit(kitti, "val").frame_ids == tuple(lists["val"])
+    assert write_train_val_lists(kitti) == [], "they are there"
+
+
+def test_lists_of_ones_own_stay(kitti: Path) -> None:
+    write_image_set(kitti, "val", ["000001"])
+    with pytest.raises(OutputError, match=r"val\.txt: lists other frames"):
+        write_train_val_lists(kitti)
+    assert [path.name for path in (kitti / "ImageSets").iterdir()] == ["val.txt"]
+    assert KittiSplit(kitti, "val").frame_ids == ("000001",)
+
+
+def test_other_frames_than_kittis_are_refused(kitti: Path) -> None:
+    folder = kitti / "training" / "velodyne"
+    for old, new, message in (("000007", ".000007", "7480 of KITTI's 7481"), ("000007", "007481", "and 1 others")):
+        (folder / f"{old}.bin").rename(folder / f"{new}.bin")
+        with pytest.raises(DatasetError, match=message):
+            write_train_val_lists(kitti)
+        (folder / f"{new}.bin").rename(folder / f"{old}.bin")
+    assert not (kitti / "ImageSets").exists()
+
+
+def test_asca_prepare_writes_them_first(kitti: Path) -> None:
+    with pytest.raises(ScanError, match="is empty"):
+        invoke("prepare", "asca_pointpillars_kitti", "--data", kitti, "--kitti-split")
+    assert {path.name for path in (kitti / "ImageSets").iterdir()} == {"train.txt", "val.txt"}

@@ -8,6 +8,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from asca_pillars.scans.recordings.messages import typestore
+from asca_pillars.scans.recordings.open_recording import open_recording
+from asca_pillars.scans.recordings.recorded_scans import RecordedScan, RecordedScans
 from benchmarks.made_recordings import point_cloud2
 
 CLOUD = "sensor_msgs/msg/PointCloud2"
@@ -29,6 +31,22 @@ def store(ros1: bool = False) -> Any:
     from rosbags.typesys import Stores, get_typestore
 
     return get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_HUMBLE)
+
+
+def serialized(message: Any, kind: str, *, ros1: bool = False, one: Any = None) -> bytes:
+    """A message's bytes; `one` is a store with types that others have not."""
+    one = one or typestore("ros1" if ros1 else "cdr")
+    return bytes(one.serialize_ros1(message, kind) if ros1 else one.serialize_cdr(message, kind))
+
+
+def header(types: Any, time_ns: int, frame_id: str, *, ros1: bool = False) -> Any:
+    stamp = types["builtin_interfaces/msg/Time"](sec=time_ns // 10**9, nanosec=time_ns % 10**9)
+    return types["std_msgs/msg/Header"](**({"seq": 0} if ros1 else {}), stamp=stamp, frame_id=frame_id)
+
+
+def read_scans(path: Path, topic: str | None = None, *, start: int = 0) -> list[RecordedScan]:
+    recording = open_recording(path)
+    return list(RecordedScans(recording, recording.point_cloud_topic(topic), 1.0).read(start))
 
 
 def laid_out(
@@ -82,26 +100,29 @@ def write_mcap(
     has_schema: bool = True,
     **options: Any,
 ) -> Path:
-    """An MCAP with topics of (time, PointCloud2 message or raw bytes); `others` are topics of other types.
+    """An MCAP with topics of (time, PointCloud2 message or raw bytes).
 
-    `images` are topics of (type, encoding, (time, raw bytes)).
-
-    `options` are those of the writer.
+    `others` are topics of other types, `images` topics of (type, encoding, (time, raw bytes)), `options` the writer's.
     """
     from mcap.writer import Writer
 
-    one = store()
-    definition, _ = one.generate_msgdef(CLOUD, ros_version=2)
+    one, schemas = store(), dict[str, int]()
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("wb") as file:
         writer = Writer(file, chunk_size=chunk_size, **options)
         writer.start(profile="ros2", library="test")
-        schema = writer.register_schema(CLOUD, "ros2msg", definition.encode()) if has_schema else 0
-        for topic, messages in topics.items():
-            channel = writer.register_channel(topic, "cdr", schema)
+
+        def add(topic: str, kind: str, messages: list[tuple[int, Any]]) -> None:
+            if kind not in schemas:
+                text = one.generate_msgdef(kind, ros_version=2)[0].encode()
+                schemas[kind] = writer.register_schema(kind, "ros2msg", text) if has_schema else 0
+            channel = writer.register_channel(topic, "cdr", schemas[kind])
             for time_ns, message in messages:
-                data = message if isinstance(message, bytes) else bytes(one.serialize_cdr(message, CLOUD))
+                data = message if isinstance(message, bytes) else serialized(message, kind)
                 writer.add_message(channel, time_ns, data, time_ns)
+
+        for topic, messages in topics.items():
+            add(topic, CLOUD, messages)
         for topic, kind in (others or {}).items():
             other = writer.register_channel(topic, "cdr", writer.register_schema(kind, "ros2msg", b"string data"))
             writer.add_message(other, START_NS, b"\x00\x01\x00\x00\x01\x00\x00\x00\x00", START_NS)
@@ -110,19 +131,9 @@ def write_mcap(
             for time_ns, content in stored:
                 writer.add_message(channel, time_ns, content, time_ns)
         if odometry:
-            data, _ = one.generate_msgdef(ODOMETRY, ros_version=2)
-            channel = writer.register_channel(
-                "/odom", "cdr", writer.register_schema(ODOMETRY, "ros2msg", data.encode())
-            )
-            for time_ns, message in odometry:
-                writer.add_message(channel, time_ns, bytes(one.serialize_cdr(message, ODOMETRY)), time_ns)
+            add("/odom", ODOMETRY, odometry)
         if transforms:
-            data, _ = one.generate_msgdef(TRANSFORMS, ros_version=2)
-            channel = writer.register_channel(
-                "/tf_static", "cdr", writer.register_schema(TRANSFORMS, "ros2msg", data.encode())
-            )
-            for message in transforms:
-                writer.add_message(channel, START_NS, bytes(one.serialize_cdr(message, TRANSFORMS)), START_NS)
+            add("/tf_static", TRANSFORMS, [(START_NS, message) for message in transforms])
         writer.finish()
     return path
 
@@ -133,10 +144,8 @@ def transform_message(parent: str, child: str, matrix: NDArray[np.float64], *, r
     x, y, z, w = Rotation.from_matrix(matrix[:3, :3]).as_quat().tolist()
     shift = types["geometry_msgs/msg/Vector3"](*matrix[:3, 3].tolist())
     turn = types["geometry_msgs/msg/Quaternion"](x=x, y=y, z=z, w=w)
-    stamp = types["builtin_interfaces/msg/Time"](sec=0, nanosec=0)
-    head = {"seq": 0} if ros1 else {}
     stamped = types["geometry_msgs/msg/TransformStamped"](
-        header=types["std_msgs/msg/Header"](stamp=stamp, frame_id=parent, **head),
+        header=header(types, 0, parent, ros1=ros1),
         child_frame_id=child,
         transform=types["geometry_msgs/msg/Transform"](translation=shift, rotation=turn),
     )
@@ -148,7 +157,6 @@ def odometry_message(
 ) -> Any:
     """At x_m on the x axis, turned about x by roll, then about y by pitch, then about z by yaw."""
     types = store().types
-    stamp = types["builtin_interfaces/msg/Time"](sec=time_ns // 10**9, nanosec=time_ns % 10**9)
     vector, covariance = types["geometry_msgs/msg/Vector3"], np.zeros(36)
     x, y, z, w = Rotation.from_euler("xyz", [roll_rad, pitch_rad, yaw_rad]).as_quat().tolist()
     turn = types["geometry_msgs/msg/Quaternion"](x=x, y=y, z=z, w=w)
@@ -157,7 +165,7 @@ def odometry_message(
     )
     twist = types["geometry_msgs/msg/Twist"](linear=vector(x=0.0, y=0.0, z=0.0), angular=vector(x=0.0, y=0.0, z=0.0))
     return types[ODOMETRY](
-        header=types["std_msgs/msg/Header"](stamp=stamp, frame_id="odom"),
+        header=header(types, time_ns, "odom"),
         child_frame_id="base_link",
         pose=types["geometry_msgs/msg/PoseWithCovariance"](pose=pose, covariance=covariance),
         twist=types["geometry_msgs/msg/TwistWithCovariance"](twist=twist, covariance=covariance),
@@ -171,9 +179,8 @@ def image_message(
     types = store(ros1).types
     height, width, channels = pixels.shape
     rows = np.pad(pixels.reshape(height, -1), ((0, 0), (0, padding)))
-    stamp = types["builtin_interfaces/msg/Time"](sec=time_ns // 10**9, nanosec=time_ns % 10**9)
     return types["sensor_msgs/msg/Image"](
-        header=types["std_msgs/msg/Header"](**({"seq": 0} if ros1 else {}), stamp=stamp, frame_id="camera"),
+        header=header(types, time_ns, "camera", ros1=ros1),
         height=height, width=width, encoding=encoding, is_bigendian=0, step=width * channels + padding,
         data=rows.reshape(-1),
     )  # fmt: skip
@@ -181,11 +188,9 @@ def image_message(
 
 def compressed_image(time_ns: int, content: bytes, format_: str = "jpeg") -> bytes:
     """A sensor_msgs/CompressedImage in CDR."""
-    one = store()
-    stamp = one.types["builtin_interfaces/msg/Time"](sec=time_ns // 10**9, nanosec=time_ns % 10**9)
-    header = one.types["std_msgs/msg/Header"](stamp=stamp, frame_id="camera")
-    kind = "sensor_msgs/msg/CompressedImage"
-    return bytes(one.serialize_cdr(one.types[kind](header, format_, np.frombuffer(content, np.uint8)), kind))
+    types, kind = store().types, "sensor_msgs/msg/CompressedImage"
+    message = types[kind](header(types, time_ns, "camera"), format_, np.frombuffer(content, np.uint8))
+    return serialized(message, kind)
 
 
 def clouds(count: int, points: int = 50) -> list[tuple[int, Any]]:

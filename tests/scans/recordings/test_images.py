@@ -11,7 +11,7 @@ import pytest
 pytest.importorskip("rosbags", reason="needs pip install -e '.[recordings]'")
 
 from asca_pillars.base.errors import ScanError
-from asca_pillars.scans.recordings.images import CameraImage, NearestImages, read_image
+from asca_pillars.scans.recordings.images import CameraImage, ImageKind, NearestImages, read_image
 from asca_pillars.scans.recordings.open_recording import open_recording
 from asca_pillars.scans.recordings.recording import Message
 from tests.scans.recordings.cloud_recordings import (
@@ -19,7 +19,7 @@ from tests.scans.recordings.cloud_recordings import (
     clouds,
     compressed_image,
     image_message,
-    store,
+    serialized,
     write_mcap,
 )
 
@@ -33,8 +33,7 @@ STEP_NS = 100_000_000
 @pytest.mark.parametrize(("encoding", "order"), [("mono8", "L"), ("rgb8", "RGB"), ("bgr8", "BGR"), ("bgra8", "BGRA")])
 def test_pixels_come_without_the_padding_of_their_rows(encoding: str, order: str, ros1: bool) -> None:
     pixels = np.random.default_rng(1).integers(0, 255, (5, 7, len(order)), np.uint8)
-    message, one = image_message(START_NS, pixels, encoding, padding=3, ros1=ros1), store(ros1)
-    data = bytes(one.serialize_ros1(message, IMAGE) if ros1 else one.serialize_cdr(message, IMAGE))
+    data = serialized(image_message(START_NS, pixels, encoding, padding=3, ros1=ros1), IMAGE, ros1=ros1)
     image = read_image(Message(5, data, "ros1" if ros1 else "cdr"), "Image")
     assert (image.time_ns, image.kind) == (START_NS, order)
     np.testing.assert_array_equal(image.content, pixels)
@@ -65,27 +64,31 @@ def protobuf(sec: int, nanosec: int, content: bytes) -> bytes:
 
 
 def test_what_cannot_be_shown_is_refused() -> None:
-    depth = image_message(START_NS, PIXELS, "16UC1")
-    short = image_message(START_NS, PIXELS, "rgb8")
+    depth, short = image_message(START_NS, PIXELS, "16UC1"), image_message(START_NS, PIXELS, "rgb8")
     short.height = 5
-    for message, said in ((depth, "'16UC1'; mono8, rgb8"), (short, "72 bytes where 5 rows of 18 hold 6 pixels of 3")):
+    packed = compressed_image(START_NS, bytes(12) + PNG, "compressedDepth png")
+    kinds: tuple[tuple[bytes, ImageKind, str], ...] = (
+        (serialized(depth, IMAGE), "Image", "'16UC1'; mono8, rgb8"),
+        (serialized(short, IMAGE), "Image", "72 bytes where 5 rows of 18 hold 6 pixels of 3"),
+        (packed, "CompressedImage", "neither JPEG nor PNG but 'compressedDepth png'"),
+    )
+    for data, kind, said in kinds:
         with pytest.raises(ValueError, match=said):
-            read_image(Message(5, bytes(store().serialize_cdr(message, IMAGE)), "cdr"), "Image")
-    with pytest.raises(ValueError, match="neither JPEG nor PNG but 'compressedDepth png'"):
-        read_image(
-            Message(5, compressed_image(START_NS, bytes(12) + PNG, "compressedDepth png"), "cdr"), "CompressedImage"
-        )
+            read_image(Message(5, data, "cdr"), kind)
 
 
-def recording(path: Path, times: list[int], **topics: tuple[str, str, list[tuple[int, bytes]]]) -> Path:
-    stored = [(time_ns, compressed_image(time_ns, JPEG)) for time_ns in times]
-    return write_mcap(path, {"/lidar": clouds(3)}, images={"/camera": (COMPRESSED, "cdr", stored), **topics})
+def recording(path: Path, images: list[tuple[int, bytes]], **topics: tuple[str, str, list[tuple[int, bytes]]]) -> Path:
+    return write_mcap(path, {"/lidar": clouds(3)}, images={"/camera": (COMPRESSED, "cdr", images), **topics})
+
+
+def images_at(*times: int) -> list[tuple[int, bytes]]:
+    return [(time_ns, compressed_image(time_ns, JPEG)) for time_ns in times]
 
 
 def test_each_time_gets_the_nearest_image(tmp_path: Path) -> None:
     rng = np.random.default_rng(2)
     times = sorted(START_NS + rng.integers(0, 20 * STEP_NS, 30))
-    images = NearestImages(open_recording(recording(tmp_path / "a.mcap", [int(time) for time in times])))
+    images = NearestImages(open_recording(recording(tmp_path / "a.mcap", images_at(*map(int, times)))))
     for asked in range(START_NS - 4 * STEP_NS, START_NS + 30 * STEP_NS, STEP_NS):
         nearest = min(abs(time - asked) for time in times)
         image = images.at(asked)
@@ -95,20 +98,23 @@ def test_each_time_gets_the_nearest_image(tmp_path: Path) -> None:
 
 
 def test_damaged_images_are_counted_and_the_others_given(tmp_path: Path) -> None:
-    path = recording(tmp_path / "a.mcap", [])
-    stored = [(START_NS + i * STEP_NS, compressed_image(START_NS + i * STEP_NS, JPEG)) for i in range(4)]
-    stored[1], stored[2] = (stored[1][0], stored[1][1][:30]), (stored[2][0], b"")
-    write_mcap(path, {"/lidar": clouds(3)}, images={"/camera": (COMPRESSED, "cdr", stored)})
-    images = NearestImages(open_recording(path))
-    given = [images.at(START_NS + i * STEP_NS) for i in range(4)]
-    assert [image and image.time_ns - START_NS for image in given] == [0, 0, 3 * STEP_NS, 3 * STEP_NS]
+    times = [START_NS + i * STEP_NS for i in range(4)]
+    stored = images_at(*times)
+    stored[1], stored[2] = (times[1], stored[1][1][:30]), (times[2], b"")
+    images = NearestImages(open_recording(recording(tmp_path / "a.mcap", stored)))
+    given = [image and image.time_ns for image in map(images.at, times)]
+    assert given == [times[0], times[0], times[3], times[3]]
     assert "/camera: 2 images were left out: " in images.remarks()[0]
 
 
 def test_the_first_topic_is_taken_or_the_one_that_is_named(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     late = [(START_NS + 10**12, b"x")]
-    recording(path, [START_NS], **{"/a/empty": (IMAGE, "cdr", []), "/zoom": ("foxglove.CompressedImage", "cbor", late)})
+    recording(
+        path,
+        images_at(START_NS),
+        **{"/a/empty": (IMAGE, "cdr", []), "/zoom": ("foxglove.CompressedImage", "cbor", late)},
+    )
     opened = open_recording(path)
     images, zoom = NearestImages(opened), NearestImages(opened, "/zoom")
     assert images.topic is not None and images.topic.name == "/camera"

@@ -15,7 +15,7 @@ from asca_pillars.base.errors import ScanError
 from asca_pillars.scans.recordings.point_cloud2 import PointCloud, read_point_cloud
 from asca_pillars.scans.recordings.recording import Encoding, Message
 from asca_pillars.scans.recordings.scan_types import ScanKind, kind_of_scans
-from tests.scans.recordings.cloud_recordings import START_NS, cloud_points, store
+from tests.scans.recordings.cloud_recordings import START_NS, cloud_points, header, serialized, store
 
 POINTS = cloud_points(3, 7)
 LIVOX = "livox_ros_driver2/msg/CustomMsg"
@@ -35,25 +35,19 @@ def read(data: bytes, kind: ScanKind, encoding: Encoding = "cdr") -> PointCloud:
     return read_point_cloud(Message(5, data, encoding), "here", kind)
 
 
-def header(one: Any, ros1: bool = False, frame_id: str = "lidar") -> Any:
-    stamp = one.types["builtin_interfaces/msg/Time"](sec=START_NS // 10**9, nanosec=0)
-    return one.types["std_msgs/msg/Header"](**({"seq": 1} if ros1 else {}), stamp=stamp, frame_id=frame_id)
-
-
 def livox(ros1: bool, count: int, frame_id: str) -> bytes:
     one = store(ros1)
-    types = get_types_from_msg(LIVOX_TEXT, LIVOX) | get_types_from_msg(LIVOX_POINT, "livox_ros_driver2/msg/CustomPoint")
-    one.register(types)
-    point = one.types["livox_ros_driver2/msg/CustomPoint"]
+    one.register(get_types_from_msg(LIVOX_TEXT, LIVOX) | get_types_from_msg(LIVOX_POINT, f"{LIVOX[:-9]}CustomPoint"))
+    point = one.types[f"{LIVOX[:-9]}CustomPoint"]
     points = [
         point(offset_time=i, x=x, y=y, z=z, reflectivity=10 * i, tag=9, line=3)
         for i, (x, y, z, _) in enumerate(POINTS[:count].tolist())
     ]
     message = one.types[LIVOX](
-        header=header(one, ros1, frame_id), timebase=7, point_num=count, lidar_id=1, rsvd=np.zeros(3, np.uint8),
-        points=points,
+        header=header(one.types, START_NS, frame_id, ros1=ros1), timebase=7, point_num=count, lidar_id=1,
+        rsvd=np.zeros(3, np.uint8), points=points,
     )  # fmt: skip
-    return bytes(one.serialize_ros1(message, LIVOX) if ros1 else one.serialize_cdr(message, LIVOX))
+    return serialized(message, LIVOX, ros1=ros1, one=one)
 
 
 @pytest.mark.parametrize("ros1", [False, True])
@@ -70,19 +64,16 @@ def test_livox(ros1: bool, frame_id: str, count: int) -> None:
 @pytest.mark.parametrize("ros1", [False, True])
 @pytest.mark.parametrize("channel", ["intensity", "Intensities", None])
 def test_the_old_point_cloud(ros1: bool, channel: str | None) -> None:
-    one, kind = store(ros1), "sensor_msgs/msg/PointCloud"
-    point, values = one.types["geometry_msgs/msg/Point32"], one.types["sensor_msgs/msg/ChannelFloat32"]
+    types, kind = store(ros1).types, "sensor_msgs/msg/PointCloud"
+    point, values = types["geometry_msgs/msg/Point32"], types["sensor_msgs/msg/ChannelFloat32"]
     channels = [values(name="ring", values=np.zeros(7, np.float32))]
     channels += [values(name=channel, values=POINTS[:, 3].copy())] if channel else []
     points = [point(x=x, y=y, z=z) for x, y, z, _ in POINTS.tolist()]
-    message = one.types[kind](header=header(one, ros1), points=points, channels=channels)
-    data = bytes(one.serialize_ros1(message, kind) if ros1 else one.serialize_cdr(message, kind))
-    cloud = read(data, "PointCloud", "ros1" if ros1 else "cdr")
+    message = types[kind](header=header(types, START_NS, "lidar", ros1=ros1), points=points, channels=channels)
+    cloud = read(serialized(message, kind, ros1=ros1), "PointCloud", "ros1" if ros1 else "cdr")
     assert np.array_equal(cloud.points.xyz, POINTS[:, :3]) and cloud.time_ns == START_NS
-    if channel:
-        assert cloud.points.reflectance is not None and np.array_equal(cloud.points.reflectance, POINTS[:, 3])
-    else:
-        assert cloud.points.reflectance is None
+    assert (cloud.points.reflectance is None) == (channel is None)
+    assert cloud.points.reflectance is None or np.array_equal(cloud.points.reflectance, POINTS[:, 3])
 
 
 def foxglove_json(**changes: Any) -> bytes:
@@ -122,23 +113,17 @@ def test_what_breaks_off_is_refused(cut: int) -> None:
 
 
 def test_a_claim_of_many_points_takes_no_memory() -> None:
-    data = bytearray(livox(False, 7, "lidar"))
-    place = data.index((7).to_bytes(4, "little"), 40)
-    data[place : place + 4] = b"\xff\xff\xff\x7f"
-    places = [i for i in range(len(data) - 3) if data[i : i + 4] == (7).to_bytes(4, "little")]
-    for one in places:
-        data[one : one + 4] = b"\xff\xff\xff\x7f"
+    seven = (7).to_bytes(4, "little")  # the number of points, stated twice
     with pytest.raises(ScanError, match="need more"):
-        read(bytes(data), "Livox")
+        read(livox(False, 7, "lidar").replace(seven, b"\xff\xff\xff\x7f"), "Livox")
 
 
-@pytest.mark.parametrize("wrong", [{"data": "###"}, {"fields": [{"name": "x", "type": 0}]}, {"point_stride": 0}])
-def test_json_that_contradicts_itself(wrong: dict[str, Any]) -> None:
-    if "point_stride" in wrong:
-        with pytest.raises(ScanError, match="beyond"):
-            read(foxglove_json(**wrong), "Foxglove", "json")
-        return
-    with pytest.raises(ScanError, match="here"):
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [({"data": "###"}, "here"), ({"fields": [{"name": "x", "type": 0}]}, "here"), ({"point_stride": 0}, "beyond")],
+)
+def test_json_that_contradicts_itself(wrong: dict[str, Any], message: str) -> None:
+    with pytest.raises(ScanError, match=message):
         read(foxglove_json(**wrong), "Foxglove", "json")
 
 

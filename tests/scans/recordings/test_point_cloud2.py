@@ -1,5 +1,8 @@
 """PointCloud2 of any layout gives the points that were put into it."""
 
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -9,7 +12,7 @@ from asca_pillars.base.errors import ScanError
 from asca_pillars.scans.recordings.point_cloud2 import PointCloud, read_point_cloud
 from asca_pillars.scans.recordings.recording import Message
 from benchmarks.made_recordings import point_cloud2
-from tests.scans.recordings.cloud_recordings import CLOUD, START_NS, cloud_points, laid_out, store
+from tests.scans.recordings.cloud_recordings import CLOUD, START_NS, cloud_points, laid_out, serialized, store
 
 POINTS = cloud_points(1, 24)
 OUSTER = [
@@ -22,8 +25,9 @@ OUSTER = [
 ]
 
 
-def read(message: object, recorded_ns: int = 5) -> PointCloud:
-    return read_point_cloud(Message(recorded_ns, bytes(store().serialize_cdr(message, CLOUD)), "cdr"), "here")
+def read(message: Any, recorded_ns: int | None = 5, *, ros1: bool = False) -> PointCloud:
+    data = message if isinstance(message, bytes) else serialized(message, CLOUD, ros1=ros1)
+    return read_point_cloud(Message(recorded_ns, data, "ros1" if ros1 else "cdr"), "here")
 
 
 @pytest.mark.parametrize("big_endian", [False, True])
@@ -47,28 +51,21 @@ def test_whole_numbers_as_drivers_write_them() -> None:
     assert cloud.points.dtype.kind == "u" and np.array_equal(cloud.points.xyz, POINTS[:, :3])
 
 
-def test_without_a_reflectance() -> None:
-    assert (
-        read(laid_out(POINTS, layout=[("x", "f4", 0), ("y", "f4", 4), ("z", "f4", 8)], step=12)).points.reflectance
-        is None
-    )
-
-
-def test_the_stamp_of_the_header_counts_and_the_recorded_time_where_there_is_none() -> None:
-    assert read(laid_out(POINTS)).time_ns == START_NS
-    assert read(laid_out(POINTS, time_ns=0), recorded_ns=77).time_ns == 77
-    for known in (read(laid_out(POINTS)), read(laid_out(POINTS, time_ns=0), recorded_ns=0)):
-        assert known.points.remarks == ()
-
-
-def test_a_time_that_is_nowhere_is_zero_and_said() -> None:
-    data = bytes(store().serialize_cdr(laid_out(POINTS, time_ns=0), CLOUD))
-    cloud = read_point_cloud(Message(None, data, "cdr"), "here")
-    assert cloud.time_ns == 0 and "time stamp" in cloud.points.remarks[0]
-
-
-def test_no_points() -> None:
+def test_without_a_reflectance_and_without_points() -> None:
+    cloud = read(laid_out(POINTS, layout=[("x", "f4", 0), ("y", "f4", 4), ("z", "f4", 8)], step=12))
+    assert cloud.points.reflectance is None
     assert len(read(laid_out(POINTS[:0])).points.xyz) == 0
+
+
+@pytest.mark.parametrize(
+    ("stamp_ns", "recorded_ns", "expected"), [(START_NS, 5, START_NS), (0, 77, 77), (0, 0, 0), (0, None, 0)]
+)
+def test_the_stamp_of_the_header_counts_and_the_recorded_time_where_there_is_none(
+    stamp_ns: int, recorded_ns: int | None, expected: int
+) -> None:
+    cloud = read(laid_out(POINTS, time_ns=stamp_ns), recorded_ns)
+    assert cloud.time_ns == expected
+    assert ["time stamp" in remark for remark in cloud.points.remarks] == [True] * (recorded_ns is None)
 
 
 def test_the_last_row_may_lack_its_padding() -> None:
@@ -84,36 +81,28 @@ def test_the_last_row_may_lack_its_padding() -> None:
 @pytest.mark.parametrize("ros1", [False, True])
 def test_a_wrong_row_step_where_there_is_no_room_for_padding(row_step: int, ros1: bool) -> None:
     """Drivers write the whole cloud's bytes, its width, or nothing."""
-    one = store(ros1)
-    message = point_cloud2(one, START_NS, POINTS)
+    message = point_cloud2(store(ros1), START_NS, POINTS)
     message.height, message.width, message.row_step = 4, 6, row_step
-    if ros1:
-        cloud = read_point_cloud(Message(1, bytes(one.serialize_ros1(message, CLOUD)), "ros1"), "here")
-    else:
-        cloud = read(message)
-    assert np.array_equal(cloud.points.xyz, POINTS[:, :3])
+    assert np.array_equal(read(message, ros1=ros1).points.xyz, POINTS[:, :3])
 
 
-def test_ros1() -> None:
-    one = store(ros1=True)
-    data = bytes(one.serialize_ros1(point_cloud2(one, START_NS, POINTS), CLOUD))
-    assert np.array_equal(read_point_cloud(Message(1, data, "ros1"), "here").points.xyz, POINTS[:, :3])
+def _enlarge(cloud: Any) -> None:
+    cloud.height = cloud.width = 2**31 - 1
 
 
-def test_contradictions_are_named() -> None:
-    with pytest.raises(ScanError, match="no field z among x, y, ring"):
-        read(laid_out(POINTS, layout=[("x", "f4", 0), ("y", "f4", 4), ("ring", "u2", 8)], step=12))
-    message = laid_out(POINTS)
-    message.fields[0].offset = 14
-    with pytest.raises(ScanError, match="field x at byte 14 lies beyond the points' 16 bytes"):
-        read(message)
-    message = laid_out(POINTS)
-    message.fields[1].datatype = 12
-    with pytest.raises(ScanError, match="field y has datatype 12"):
-        read(message)
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda cloud: setattr(cloud.fields[2], "name", "ring"), "no field z among x, y, ring"),
+        (lambda cloud: setattr(cloud.fields[0], "offset", 14), "field x at byte 14 lies beyond the points' 16 bytes"),
+        (lambda cloud: setattr(cloud.fields[1], "datatype", 12), "field y has datatype 12"),
+        (_enlarge, "points are more than"),
+    ],
+)
+def test_contradictions_are_named(change: Callable[[Any], object], message: str) -> None:
+    cloud = laid_out(POINTS)
+    change(cloud)
+    with pytest.raises(ScanError, match=message):
+        read(cloud)
     with pytest.raises(ScanError, match="no readable PointCloud2"):
-        read_point_cloud(Message(1, b"torn", "cdr"), "here")
-    message = laid_out(POINTS)
-    message.height = message.width = 2**31 - 1
-    with pytest.raises(ScanError, match="points are more than"):
-        read(message)
+        read(b"torn")

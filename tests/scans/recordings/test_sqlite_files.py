@@ -1,7 +1,7 @@
 """SQLite files of rosbag2 with rows that cannot be used."""
 
 import sqlite3
-from contextlib import closing
+from contextlib import closing, suppress
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -13,8 +13,16 @@ pytest.importorskip("rosbags", reason="needs pip install -e '.[recordings]'")
 from asca_pillars.base.errors import ScanError
 from asca_pillars.scans.recordings.odometry import read_poses
 from asca_pillars.scans.recordings.open_recording import open_recording
-from asca_pillars.scans.recordings.recorded_scans import RecordedScan, RecordedScans
-from tests.scans.recordings.cloud_recordings import CLOUD, ODOMETRY, clouds, odometry_message, stamps, store
+from asca_pillars.scans.recordings.recorded_scans import RecordedScans
+from tests.scans.recordings.cloud_recordings import (
+    CLOUD,
+    ODOMETRY,
+    clouds,
+    odometry_message,
+    read_scans,
+    serialized,
+    stamps,
+)
 
 # As version 1 of rosbag2 has them; later ones have more columns and tables.
 TABLES = """
@@ -39,7 +47,7 @@ def database(path: Path, *statements: tuple[str, tuple[Any, ...]], stamped: bool
         for time_ns, message in clouds(5, points):
             if not stamped:
                 message.header.stamp.sec = message.header.stamp.nanosec = 0
-            data = bytes(store().serialize_cdr(message, CLOUD))
+            data = serialized(message, CLOUD)
             connection.execute("INSERT INTO messages(topic_id, timestamp, data) VALUES (1, ?, ?)", (time_ns, data))
         for statement, values in statements:
             connection.execute(statement, values)
@@ -47,14 +55,9 @@ def database(path: Path, *statements: tuple[str, tuple[Any, ...]], stamped: bool
     return path
 
 
-def scans(path: Path, topic: str | None = None) -> list[RecordedScan]:
-    recording = open_recording(path)
-    return list(RecordedScans(recording, recording.point_cloud_topic(topic), 1.0).read())
-
-
 @pytest.mark.parametrize("data", [None, 7, 1.5, "text", b"", b"torn"], ids=str)
 def test_a_row_without_usable_data_costs_its_scan_alone(tmp_path: Path, data: Any) -> None:
-    found = scans(database(tmp_path / "a.db3", ("UPDATE messages SET data = ? WHERE id = 3", (data,))))
+    found = read_scans(database(tmp_path / "a.db3", ("UPDATE messages SET data = ? WHERE id = 3", (data,))))
     assert [one.scan is not None for one in found] == [True, True, False, True, True]
     assert [one.time_ns for one in found] == stamps(5)
     assert "a.db3, /lidar, message 2" in str(found[2].error_text)
@@ -63,44 +66,45 @@ def test_a_row_without_usable_data_costs_its_scan_alone(tmp_path: Path, data: An
 @pytest.mark.parametrize("time_ns", [None, 1e300, 1.5, -1, -(2**63), "soon", b"\xff"], ids=str)
 def test_times_that_are_none_are_taken_as_zero_and_said(tmp_path: Path, time_ns: Any) -> None:
     changed = ("UPDATE messages SET timestamp = ? WHERE id = 3", (time_ns,))
-    found = scans(database(tmp_path / "a.db3", changed, stamped=False))
+    found = read_scans(database(tmp_path / "a.db3", changed, stamped=False))
     assert sorted(one.time_ns for one in found) == [0, *stamps(5)[:2], *stamps(5)[3:]]
     for one in found:
         assert one.scan is not None and isinstance(one.time_ns, int)
         assert bool(one.scan.notes.remarks) == (one.time_ns == 0)
     # Where the header has a stamp, nothing is wrong.
-    found = scans(database(tmp_path / "b.db3", changed))
+    found = read_scans(database(tmp_path / "b.db3", changed))
     assert sorted(one.time_ns for one in found) == stamps(5)
     assert all(one.scan is not None and one.scan.notes.remarks == () for one in found)
 
 
-@pytest.mark.parametrize("column", ["name", "type", "serialization_format"])
-@pytest.mark.parametrize("value", [None, 7, b"\xff", ""], ids=str)
-def test_topics_that_are_not_described(tmp_path: Path, column: str, value: Any) -> None:
-    path = database(
-        tmp_path / "a.db3",
-        (f"UPDATE topics SET {column} = ?", (value,)),
-        ("INSERT INTO topics VALUES (2, '/odom', 'nav_msgs/msg/Odometry', 'cdr')", ()),
-    )
-    recording = open_recording(path)
-    if column == "name" and value != 7:  # SQLite keeps 7 as text
-        with pytest.raises(ScanError, match=r"a\.db3: 5 messages belong to no topic with a name; .* /odom .*again"):
-            recording.point_cloud_topic()
-    elif column == "type" and value != 7:
-        with pytest.raises(ScanError, match=r"name it \(--topic /lidar\)"):
-            recording.point_cloud_topic()
-        assert len(scans(path, "/lidar")) == 5
-    elif column == "serialization_format" and value == 7:
-        with pytest.raises(ScanError, match="is encoded as 7; cdr is read"):
-            scans(path)
-    elif column == "serialization_format":
-        assert len(scans(path)) == 5
+UNUSABLE = (None, b"\xff", "")
+
+
+@pytest.mark.parametrize(
+    ("column", "value", "message"),
+    [
+        *(("name", value, "5 messages belong to no topic with a name; .* /odom .*again") for value in UNUSABLE),
+        ("name", 7, None),  # SQLite keeps it as text
+        *(("type", value, r"name it \(--topic /lidar\)") for value in UNUSABLE),
+        ("type", 7, "/lidar"),
+        *(("serialization_format", value, None) for value in UNUSABLE),
+        ("serialization_format", 7, "is encoded as 7; cdr is read"),
+    ],
+)
+def test_topics_that_are_not_described(tmp_path: Path, column: str, value: Any, message: str | None) -> None:
+    odometry = "INSERT INTO topics VALUES (2, '/odom', 'nav_msgs/msg/Odometry', 'cdr')"
+    path = database(tmp_path / "a.db3", (f"UPDATE topics SET {column} = ?", (value,)), (odometry, ()))
+    if message is None:
+        assert len(read_scans(path)) == 5
+        return
+    with pytest.raises(ScanError, match=message):
+        read_scans(path)
+    assert column != "type" or value == 7 or len(read_scans(path, "/lidar")) == 5
 
 
 def test_messages_of_no_topic(tmp_path: Path) -> None:
-    recording = open_recording(database(tmp_path / "a.db3", ("DELETE FROM topics", ())))
     with pytest.raises(ScanError, match="5 messages belong to no topic"):
-        recording.point_cloud_topic()
+        read_scans(database(tmp_path / "a.db3", ("DELETE FROM topics", ())))
 
 
 def test_a_view_is_no_table(tmp_path: Path) -> None:
@@ -115,17 +119,14 @@ def test_damaged_pages_cost_the_scans_on_them(tmp_path: Path) -> None:
     whole = database(tmp_path / "a.db3", points=2000).read_bytes()  # each on pages of its own
     counts = set()
     for start in range(4096, len(whole), 4096):
-        damaged = bytearray(whole)
-        damaged[start : start + 4096] = b"\xff" * 4096
+        damaged = whole[:start] + b"\xff" * 4096 + whole[start + 4096 :]
         (tmp_path / "b.db3").write_bytes(damaged)
-        try:
+        with suppress(ScanError):
             recording = open_recording(tmp_path / "b.db3")
             found = list(RecordedScans(recording, recording.point_cloud_topic(), 1.0).read())
-        except ScanError:
-            continue
-        assert [one.time_ns for one in found] == stamps(5)[: len(found)]
-        assert recording.damage is not None or len(found) == 5
-        counts.add(sum(one.scan is not None for one in found))
+            assert [one.time_ns for one in found] == stamps(5)[: len(found)]
+            assert recording.damage is not None or len(found) == 5
+            counts.add(sum(one.scan is not None for one in found))
     assert max(counts) <= 5 and 4 in counts
 
 
@@ -147,10 +148,8 @@ def test_damaged_rows_do_not_lead_back_to_earlier_ones(tmp_path: Path, bits: lis
 
 
 def test_poses_without_a_time_are_left_out(tmp_path: Path) -> None:
-    message = odometry_message(0, 1.0)
-    data = bytes(store().serialize_cdr(message, ODOMETRY))
-    rows: list[tuple[str, tuple[Any, ...]]]
-    rows = [("INSERT INTO topics VALUES (2, '/odom', 'nav_msgs/msg/Odometry', 'cdr')", ())]
-    rows += [("INSERT INTO messages(topic_id, timestamp, data) VALUES (2, ?, ?)", (t, data)) for t in (None, 1e300, 5)]
-    poses = read_poses(open_recording(database(tmp_path / "a.db3", *rows)), "/odom")
-    assert poses.times_ns.tolist() == [5]
+    data = serialized(odometry_message(0, 1.0), ODOMETRY)
+    add = "INSERT INTO messages(topic_id, timestamp, data) VALUES (2, ?, ?)"
+    topic: tuple[str, tuple[Any, ...]] = ("INSERT INTO topics VALUES (2, '/odom', 'nav_msgs/msg/Odometry', 'cdr')", ())
+    path = database(tmp_path / "a.db3", topic, *((add, (time_ns, data)) for time_ns in (None, 1e300, 5)))
+    assert read_poses(open_recording(path), "/odom").times_ns.tolist() == [5]
