@@ -48,7 +48,9 @@ def wrap_angle(angle_rad: ArrayLike, period: float = 2 * math.pi) -> NDArray[Any
     dtype = np.dtype(np.float32) if angle.dtype == np.float32 else np.dtype(np.float64)
     angle = angle.astype(np.float64)
     half = period / 2
-    wrapped = angle - period * np.floor((angle + half) / period)
+    # The sum of a half and an angle just below a half rounds to the period.
+    turns = np.where((angle >= -half) & (angle < half), 0, np.floor((angle + half) / period))
+    wrapped = angle - period * turns
     wrapped = np.where(wrapped >= half, -half, np.maximum(wrapped, -half)).astype(dtype)
     if dtype == np.float32:
         low, high = np.float32(-half), np.float32(half)

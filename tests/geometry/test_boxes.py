@@ -92,6 +92,7 @@ def test_no_boxes_and_no_points() -> None:
 
 @given(st.floats(-1e4, 1e4), st.sampled_from([2 * math.pi, math.pi, 1.0]), st.sampled_from([np.float32, float]))
 @example(-0.5, 1.0, np.float32)  # a lower end that float32 holds exactly
+@example(math.nextafter(math.pi, 0), 2 * math.pi, np.float64)
 def test_wrapped_angles_differ_by_whole_periods(angle: float, period: float, dtype: type) -> None:
     angle = dtype(angle)
     wrapped = wrap_angle(angle, period)
