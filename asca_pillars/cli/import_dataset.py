@@ -76,6 +76,8 @@ def import_dataset(
 
     from asca_pillars.base.errors import ConfigError, printable
     from asca_pillars.base.extras import require
+    from asca_pillars.base.progress import Reporter
+    from asca_pillars.cli.progress import Bars
     from asca_pillars.data.importing.imported import drop_unwritable, rename_types, require_own_dataset, write_imported
     from asca_pillars.scans.scan_settings import ScanSettings
 
@@ -97,12 +99,13 @@ def import_dataset(
     )
     if scans is None and settings != ScanSettings():
         raise ConfigError(f"--from {source_format} knows how its scans lie: leave --axes, --columns and the like out")
-    imported = form.read(source, out=out, scans=scans, settings=settings)
+    console = Console(markup=False, highlight=False)
+    with Bars(console, transient=True) as bars:
+        imported = form.read(source, out=out, scans=scans, settings=settings, reporter=Reporter(bars))
     names = dict(text.split("=", 1) for text in rename or ())
     imported = rename_types(drop_unwritable(imported), names)
     counts = write_imported(out, imported, val_share)
     boxes = ", ".join(f"{name} {count}" for name, count in counts.boxes.items()) or "none"
-    console = Console(markup=False, highlight=False)
     console.print(f"{out}: {counts.train} frames to train on, {counts.val} to validate; boxes: {boxes}", soft_wrap=True)
     for line in (*imported.left_out.lines(), *([counts.doubt] if counts.doubt else [])):
         console.print(printable(line), style="yellow", soft_wrap=True)

@@ -8,9 +8,9 @@ from collections import defaultdict
 from pathlib import Path
 
 import numpy as np
-from rich.progress import track
 
 from asca_pillars.base.errors import DatasetError
+from asca_pillars.base.progress import SILENT, Reporter
 from asca_pillars.data.boxes.box_records import can_be_written, records_from
 from asca_pillars.data.boxes.box_split import BoxDataset
 from asca_pillars.data.importing.foreign_values import SkippedEntries, text_of
@@ -28,7 +28,7 @@ _SIZE = ("length_m", "width_m", "height_m")
 _TURN = ("qw", "qx", "qy", "qz")
 
 
-def read_argoverse2(root: Path) -> Imported:
+def read_argoverse2(root: Path, reporter: Reporter = SILENT) -> Imported:
     """Read every sweep with boxes of every log below `root`.
 
     Raises:
@@ -40,7 +40,7 @@ def read_argoverse2(root: Path) -> Imported:
     if not logs:
         raise DatasetError(f"{root}: no annotations.feather below; give a folder of Argoverse 2 logs")
     left_out = SkippedEntries()
-    frames = [frame for log in track(logs, "Reading logs", transient=True) for frame in _frames(log, left_out)]
+    frames = [frame for log in reporter.track(logs, "Reading logs") for frame in _frames(log, left_out)]
     settings = BoxDataset(
         sensor_height=AXLE_HEIGHT_M, reflectance_scale=255.0, scans=str(root), sensor_position=SENSOR_POSITION_M
     )

@@ -9,6 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from asca_pillars.base.progress import SILENT, Reporter
+
 if TYPE_CHECKING:
     from asca_pillars.data.importing.imported import Imported
     from asca_pillars.data.importing.tool_labels import ScanLabels
@@ -37,7 +39,15 @@ class LabelFormat:
     writes: str | None = None
     extra: str | None = None
 
-    def read(self, source: Path, *, out: Path, scans: Path | None, settings: "ScanSettings") -> "Imported":
+    def read(
+        self,
+        source: Path,
+        *,
+        out: Path,
+        scans: Path | None,
+        settings: "ScanSettings",
+        reporter: Reporter = SILENT,
+    ) -> "Imported":
         """Read the frames of the source.
 
         Args:
@@ -45,11 +55,14 @@ class LabelFormat:
             out: output folder of the dataset.
             scans: folder of the scans, if `scans_elsewhere`.
             settings: settings of those scans.
+            reporter: told of each part that is read, where it takes long.
 
         Raises:
             DatasetError: the source is not of this format.
         """
-        arguments: dict[str, Any] = {"scans": scans, "settings": settings} if self.scans_elsewhere else {}
+        arguments: dict[str, Any] = {"scans": scans, "settings": settings}
+        if not self.scans_elsewhere:  # a dataset of its own
+            arguments = {"reporter": reporter}
         if self.writes_scans:
             arguments["out"] = out
         return _function(self.reads)(source, **arguments)

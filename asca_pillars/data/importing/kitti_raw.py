@@ -12,10 +12,10 @@ from typing import NamedTuple
 from xml.etree import ElementTree
 
 import numpy as np
-from rich.progress import track
 
 from asca_pillars.base.errors import DatasetError
 from asca_pillars.base.input_files import read_text
+from asca_pillars.base.progress import SILENT, Reporter
 from asca_pillars.data.boxes.box_records import records_from
 from asca_pillars.data.boxes.box_split import BoxDataset
 from asca_pillars.data.importing.foreign_values import SkippedEntries, numbers, text_of
@@ -36,7 +36,7 @@ class _Labels(NamedTuple):
     tracks: list[str]
 
 
-def read_kitti_raw(root: Path) -> Imported:
+def read_kitti_raw(root: Path, reporter: Reporter = SILENT) -> Imported:
     """Read every scan of every drive below `root` that has tracklets.
 
     Raises:
@@ -46,8 +46,7 @@ def read_kitti_raw(root: Path) -> Imported:
     if not drives:
         raise DatasetError(f"{root}: no {LABELS} below; give a folder of KITTI's drives, with their tracklets")
     left_out = SkippedEntries()
-    bar = track(drives, "Reading drives", transient=True)
-    frames = [frame for drive in bar for frame in _frames(drive, left_out)]
+    frames = [frame for drive in reporter.track(drives, "Reading drives") for frame in _frames(drive, left_out)]
     return Imported(BoxDataset(scans=str(root.resolve()), labeled_view_deg=LABELED_VIEW_DEG), frames, left_out)
 
 

@@ -8,10 +8,9 @@ https://www.cvlibs.net/datasets/kitti/eval_tracking.php
 from collections import defaultdict
 from pathlib import Path
 
-from rich.progress import track
-
 from asca_pillars.base.errors import DatasetError
 from asca_pillars.base.input_files import read_text
+from asca_pillars.base.progress import SILENT, Reporter
 from asca_pillars.data.boxes.box_records import BoxRecords, records_from
 from asca_pillars.data.boxes.box_split import BoxDataset
 from asca_pillars.data.importing.foreign_values import SkippedEntries
@@ -27,11 +26,12 @@ _LONGEST_FRAME = 20  # digits of a frame's number
 _Tracked = tuple[KittiObject, str]
 
 
-def read_kitti_tracking(root: Path) -> Imported:
+def read_kitti_tracking(root: Path, reporter: Reporter = SILENT) -> Imported:
     """Read every scan of every sequence that has labels.
 
     Args:
         root: the folder that contains training/, or training/ itself.
+        reporter: told of each sequence.
 
     Raises:
         DatasetError: no sequence, or a file that is not of this format.
@@ -41,7 +41,7 @@ def read_kitti_tracking(root: Path) -> Imported:
     if not labels:
         raise DatasetError(f"{folder}: no label_02/*.txt there; give the folder of KITTI's tracking benchmark")
     left_out = SkippedEntries()
-    bar = track(labels, "Reading sequences", transient=True)
+    bar = reporter.track(labels, "Reading sequences")
     frames = [frame for path in bar for frame in _frames(folder.resolve(), path, left_out)]
     settings = BoxDataset(scans=str(folder.resolve() / "velodyne"), labeled_view_deg=LABELED_VIEW_DEG)
     return Imported(settings, frames, left_out)

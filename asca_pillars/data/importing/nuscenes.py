@@ -15,11 +15,11 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.progress import track
 
 from asca_pillars.base.errors import DatasetError
 from asca_pillars.base.files import file_inside
 from asca_pillars.base.input_files import read_text
+from asca_pillars.base.progress import SILENT, Reporter
 from asca_pillars.data.boxes.box_records import BoxRecords, records_from
 from asca_pillars.data.boxes.box_split import BoxDataset
 from asca_pillars.data.importing.foreign_values import SkippedEntries, entry, numbers, text_of
@@ -49,11 +49,12 @@ _Table = dict[str, _Row]
 _Doubles = NDArray[np.float64]
 
 
-def read_nuscenes(root: Path) -> Imported:
+def read_nuscenes(root: Path, reporter: Reporter = SILENT) -> Imported:
     """Read the available key frames of LIDAR_TOP.
 
     Args:
         root: the folder with samples/ and one v1.0-*/, or that v1.0-*/.
+        reporter: told of each row of sample_data.
 
     Raises:
         DatasetError: a table is missing or not of this format.
@@ -63,7 +64,7 @@ def read_nuscenes(root: Path) -> Imported:
     left_out = SkippedEntries()
     names = ("sensor", "calibrated_sensor", "ego_pose", "sample", "scene", "category", "instance", "sample_annotation")
     read = {name: _table(tables, name, left_out) for name in (*names, "sample_data")}
-    frames = _frames(read, tables, data, left_out)
+    frames = _frames(read, tables, data, left_out, reporter)
     settings = BoxDataset(
         sensor_height=_sensor_height_m(read), axes="y-forward", reflectance_scale=255.0, columns=5, scans=str(data)
     )
@@ -80,7 +81,9 @@ def _sensor_height_m(tables: Mapping[str, _Table]) -> float | None:
     return round(float(np.median(heights)), 3) if heights else None
 
 
-def _frames(tables: Mapping[str, _Table], folder: Path, data: Path, left_out: SkippedEntries) -> list[ImportedFrame]:
+def _frames(
+    tables: Mapping[str, _Table], folder: Path, data: Path, left_out: SkippedEntries, reporter: Reporter
+) -> list[ImportedFrame]:
     labels: dict[str, list[_Row]] = {}
     for token, row in tables["sample_annotation"].items():
         try:
@@ -88,7 +91,7 @@ def _frames(tables: Mapping[str, _Table], folder: Path, data: Path, left_out: Sk
         except ValueError as reason:
             left_out.add("boxes", f"{folder}/sample_annotation.json, {token}", reason)
     frames = []
-    for token, row in track(tables["sample_data"].items(), "Reading frames", transient=True):
+    for token, row in reporter.track(tables["sample_data"].items(), "Reading frames"):
         try:
             sensor = _linked(row, "calibrated_sensor", tables)
             if row.get("is_key_frame") is not True or _channel(sensor, tables) != CHANNEL:

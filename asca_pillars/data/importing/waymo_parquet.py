@@ -14,12 +14,12 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.progress import track
 
 from asca_pillars.base.errors import AscaError, DatasetError
 from asca_pillars.base.files import atomic_path, portable_name, write_text
 from asca_pillars.base.input_files import require_content
 from asca_pillars.base.installation import install_command
+from asca_pillars.base.progress import SILENT, Reporter
 from asca_pillars.data.boxes.box_records import BoxRecords, records_from
 from asca_pillars.data.boxes.box_split import DATASET_FILE, BoxDataset
 from asca_pillars.data.importing.foreign_values import SkippedEntries, numbers, text_of, whole_number
@@ -45,12 +45,13 @@ _VEHICLE_POSE = "[VehiclePoseComponent].world_from_vehicle.transform"
 _BATCH = 8  # rows in memory at once: a range image has millions of numbers
 
 
-def read_waymo(root: Path, out: Path) -> Imported:
+def read_waymo(root: Path, out: Path, reporter: Reporter = SILENT) -> Imported:
     """Read every frame of every segment; scans are written to out/scans/<segment>/, existing ones are kept.
 
     Args:
         root: the folder with lidar/, lidar_box/ and lidar_calibration/ (training/ or validation/).
         out: output folder of the dataset.
+        reporter: told of each segment.
 
     Raises:
         DatasetError: a file is missing or not of this format.
@@ -66,7 +67,7 @@ def read_waymo(root: Path, out: Path) -> Imported:
         write_text(out / DATASET_FILE, MARKER)
     scans, left_out = out.resolve() / "scans", SkippedEntries()
     frames: list[ImportedFrame] = []
-    for path in track(segments, "Reading segments", transient=True):
+    for path in reporter.track(segments, "Reading segments"):
         labels = _labels(root / "lidar_box" / path.name, left_out)
         nothing = records_from(np.zeros((0, 7)), ())
         folder = scans / portable_name(path.stem)
