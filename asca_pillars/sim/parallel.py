@@ -32,10 +32,10 @@ def held_out(count: int, share: float) -> int:
     return min(max(rounded, 1), count - 1) if 0 < share < 1 and count > 1 else rounded
 
 
-def for_each(job: Callable[[Item], None], todo: Sequence[Item], workers: int, *, progress: bool | Progress) -> None:
+def for_each(job: Callable[[Item], None], todo: Sequence[Item], workers: int, *, progress: Progress | None) -> None:
     """Do a job for each item, in `workers` processes; the job must be picklable."""
-    done = map_in_processes(job, todo, workers, "Simulating", progress=progress is True)
-    for _ in done if isinstance(progress, bool) else Reporter(progress).track(done, "Simulating", len(todo)):
+    done = map_in_processes(job, todo, workers, "Simulating", progress=False)
+    for _ in Reporter(progress).track(done, "Simulating", len(todo)):
         pass
 
 

@@ -53,7 +53,7 @@ def simulate(
         view: "full", "camera" or "around", see `SimulationConfig`; None: that of the config.
         val_share: share of the frames in ImageSets/val.txt.
         cluster: address of a Ray cluster that does the work.
-        progress: called after each scan; not with a cluster.
+        progress: called after each scan; a cluster shows a bar of its own if it is given.
 
     Raises:
         AscaError: an argument cannot be used, or `out` holds something else.
@@ -68,14 +68,14 @@ def simulate(
     from asca_pillars.sim.simulation import load_simulation_config, require_own_frames
     from asca_pillars.sim.simulation import simulate as write_frames
 
-    out, show_progress = Path(out), progress or False
+    out = Path(out)
     settings = load_simulation_config(config, view)
     if sequences is not None:
         require_own_sequences(out)
         length = length or LENGTH
-        simulate_sequences(out, sequences, length, seed, workers, settings, val_share=val_share, progress=show_progress)
+        simulate_sequences(out, sequences, length, seed, workers, settings, val_share=val_share, progress=progress)
         return Simulated(out, out / "scans", sequences * length)
     frames = frames or FRAMES
     require_own_frames(out)
-    write_frames(out, frames, seed, workers, settings, val_share, cluster is not None or show_progress, cluster=cluster)
+    write_frames(out, frames, seed, workers, settings, val_share, progress, cluster=cluster)
     return Simulated(out, out / "training" / "velodyne", frames)

@@ -159,7 +159,7 @@ def simulate(
     workers: int = 1,
     config: SimulationConfig | None = None,
     val_share: float = 0.1,
-    progress: bool | Progress = True,
+    progress: Progress | None = None,
     *,
     cluster: str | None = None,
 ) -> Path:
@@ -177,7 +177,7 @@ def simulate(
         workers: processes, without a cluster.
         config: settings of the simulation.
         val_share: 0..1.
-        progress: whether it is shown, or a callback after each frame.
+        progress: called after each frame; a cluster shows a bar of its own if it is given.
         cluster: address of a Ray cluster that does the work, `local` for one on this machine; None: processes.
 
     Raises:
@@ -201,7 +201,7 @@ def simulate(
             seen=root / SIMULATION_FILE,
             folders=[split.folder / name for name in ("velodyne", "label_2", "calib")],
             title="Simulating",
-            progress=progress is True,
+            progress=progress is not None,
         )
     else:
         for_each(job, todo, workers, progress=progress)

@@ -34,8 +34,8 @@ def files(root: Path) -> dict[str, bytes]:
 
 
 def test_the_number_of_workers_does_not_change_a_byte(tmp_path: Path) -> None:
-    simulate(tmp_path / "one", 5, seed=3, workers=1, config=CAMERA, val_share=0.4, progress=False)
-    simulate(tmp_path / "two", 5, seed=3, workers=2, config=CAMERA, val_share=0.4, progress=False)
+    simulate(tmp_path / "one", 5, seed=3, workers=1, config=CAMERA, val_share=0.4)
+    simulate(tmp_path / "two", 5, seed=3, workers=2, config=CAMERA, val_share=0.4)
     one, two = files(tmp_path / "one"), files(tmp_path / "two")
     assert len(one) == 5 * 3 + 3  # and two lists, and what was simulated
     assert one == two
@@ -51,34 +51,34 @@ def test_a_cluster_writes_the_same_bytes(tmp_path: Path, monkeypatch: pytest.Mon
             sent(job)(item)
             handed_out.append(item)
 
-    simulate(tmp_path / "one", 4, seed=3, config=CAMERA, progress=False)
+    simulate(tmp_path / "one", 4, seed=3, config=CAMERA)
     monkeypatch.setattr("asca_pillars.sim.simulation.run_items", run_here)
-    simulate(tmp_path / "two", 2, seed=3, config=CAMERA, progress=False, cluster="made-up:1")
-    simulate(tmp_path / "two", 4, seed=3, config=CAMERA, progress=False, cluster="made-up:1")
+    simulate(tmp_path / "two", 2, seed=3, config=CAMERA, cluster="made-up:1")
+    simulate(tmp_path / "two", 4, seed=3, config=CAMERA, cluster="made-up:1")
     assert handed_out == [1, 0, 3, 2], "frames that are there are left out"
     assert files(tmp_path / "one") == files(tmp_path / "two")
 
 
 def test_an_interrupted_run_goes_on_and_ends_the_same(tmp_path: Path) -> None:
-    simulate(tmp_path / "a", 3, seed=1, config=CAMERA, progress=False)
+    simulate(tmp_path / "a", 3, seed=1, config=CAMERA)
     before = files(tmp_path / "a")
     (tmp_path / "a/training/velodyne/000001.bin").unlink()
     (tmp_path / "a/training/label_2/000001.txt").unlink()
     (tmp_path / "a/training/calib/000001.txt").write_text("")
     kept = tmp_path / "a/training/velodyne/000002.bin"
     stamp = kept.stat().st_mtime_ns
-    simulate(tmp_path / "a", 3, seed=1, config=CAMERA, progress=False)
+    simulate(tmp_path / "a", 3, seed=1, config=CAMERA)
     assert files(tmp_path / "a") == before
     assert kept.stat().st_mtime_ns == stamp
 
 
 def test_frames_of_another_seed_or_configuration_are_not_mixed(tmp_path: Path) -> None:
-    simulate(tmp_path, 1, seed=1, config=CAMERA, progress=False)
+    simulate(tmp_path, 1, seed=1, config=CAMERA)
     with pytest.raises(DatasetError, match=r"simulation\.json.*another folder"):
-        simulate(tmp_path, 2, seed=2, config=CAMERA, progress=False)
+        simulate(tmp_path, 2, seed=2, config=CAMERA)
     with pytest.raises(DatasetError, match="another folder"):
-        simulate(tmp_path, 2, seed=1, progress=False)
-    simulate(tmp_path, 2, seed=1, config=CAMERA, progress=False)
+        simulate(tmp_path, 2, seed=1)
+    simulate(tmp_path, 2, seed=1, config=CAMERA)
     assert KittiSplit(tmp_path).frame_ids == ("000000", "000001")
 
 
@@ -105,7 +105,7 @@ def test_impossible_wishes_are_refused(tmp_path: Path) -> None:
 
 
 def test_written_frames_read_back_as_simulated(tmp_path: Path) -> None:
-    simulate(tmp_path, 3, seed=5, config=CAMERA, val_share=0.34, progress=False)
+    simulate(tmp_path, 3, seed=5, config=CAMERA, val_share=0.34)
     assert KittiSplit(tmp_path, "train").frame_ids == ("000000", "000001")
     assert KittiSplit(tmp_path, "val").frame_ids == ("000002",)
     split = KittiSplit(tmp_path)
@@ -286,7 +286,7 @@ def test_around_is_the_whole_scan_with_labels_in_every_direction(whole: list[Fra
 
 
 def test_a_set_labelled_all_around_says_so_and_reads_back_for_training(tmp_path: Path) -> None:
-    simulate(tmp_path, 2, config=SimulationConfig(field_of_view="around"), progress=False)
+    simulate(tmp_path, 2, config=SimulationConfig(field_of_view="around"))
     assert json.loads((tmp_path / "simulation.json").read_text())["field_of_view"] == "around"
     split, names = KittiSplit(tmp_path), ("Car", "Pedestrian", "Cyclist")
     ahead = behind = 0
@@ -298,4 +298,4 @@ def test_a_set_labelled_all_around_says_so_and_reads_back_for_training(tmp_path:
         assert (cropped.labels[cropped.boxes[:, 0] < -2] < 0).all(), "the camera's points hold nothing of them"
     assert ahead > 0 and behind > 0
     with pytest.raises(DatasetError, match="another folder"):
-        simulate(tmp_path, 3, progress=False)
+        simulate(tmp_path, 3)

@@ -122,7 +122,7 @@ def simulate_sequences(
     config: SimulationConfig | None = None,
     *,
     val_share: float = 0.1,
-    progress: bool | Progress = True,
+    progress: Progress | None = None,
 ) -> Path:
     """Write `sequences` sequences of `length` scans each, at 10 Hz, below `out`; returns `out`.
 

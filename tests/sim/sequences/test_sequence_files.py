@@ -21,21 +21,21 @@ def files(root: Path) -> dict[str, bytes]:
 
 def test_any_number_of_workers_writes_the_same_bytes_and_an_interrupted_run_goes_on(tmp_path: Path) -> None:
     for name, workers in (("one", 1), ("two", 2)):
-        simulate_sequences(tmp_path / name, 2, 3, 4, workers, VLP, val_share=0.5, progress=False)
+        simulate_sequences(tmp_path / name, 2, 3, 4, workers, VLP, val_share=0.5)
     one = files(tmp_path / "one")
     assert len(one) == 2 * 2 * 3 + 4
     assert files(tmp_path / "two") == one
     (tmp_path / "one/scans/0001/000001.bin").unlink()
     (tmp_path / "one/scans/0001/000002.bin").unlink()
     (tmp_path / "one/labels/0001/000001.json").unlink()
-    simulate_sequences(tmp_path / "one", 2, 3, 4, 1, VLP, val_share=0.5, progress=False)
+    simulate_sequences(tmp_path / "one", 2, 3, 4, 1, VLP, val_share=0.5)
     assert files(tmp_path / "one") == one
     with pytest.raises(DatasetError, match="another folder"):
-        simulate_sequences(tmp_path / "one", 2, 4, 4, 1, VLP, progress=False)
+        simulate_sequences(tmp_path / "one", 2, 4, 4, 1, VLP)
 
 
 def test_they_are_read_as_a_dataset_of_boxes(tmp_path: Path) -> None:
-    simulate_sequences(tmp_path, 2, 2, 0, 1, VLP, val_share=0.5, progress=False)
+    simulate_sequences(tmp_path, 2, 2, 0, 1, VLP, val_share=0.5)
     split = BoxSplit(tmp_path, "val")
     assert split.frame_ids == ("0001/000000", "0001/000001")
     first, second = (split.records(frame_id) for frame_id in split.frame_ids)
