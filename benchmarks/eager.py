@@ -30,7 +30,7 @@ from asca_export.bundle_writer import MIN_SCANS, ExportOptions
 from asca_export.pillar.export import export_pillar_bundle
 from asca_pillars.base.errors import AscaError
 from asca_pillars.base.system import cpu_model, default_threads, package_versions
-from asca_pillars.cli.bench_tables import comparison_table
+from asca_pillars.cli.bench_parts import comparison_table
 from asca_pillars.cli.run_command import run_command
 from asca_pillars.config.tree import pillar_spec
 from asca_pillars.detection.decode import HeadMaps

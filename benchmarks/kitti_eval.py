@@ -17,7 +17,7 @@ import typer
 from numpy.typing import NDArray
 from rich.console import Console
 
-from asca_deploy.benchmark.resident_memory import peak_memory_mib
+from asca_deploy.benchmark.bench_report import peak_memory_mib
 from asca_pillars.cli.run_command import run_command
 from asca_pillars.evaluation.kitti.average_precision import CLASS_NAMES, DIFFICULTIES, KittiResults, evaluate
 from asca_pillars.evaluation.kitti.objects import FrameObjects

@@ -25,7 +25,7 @@ from asca_deploy.benchmark import Comparison, compare
 from asca_deploy.benchmark.speed_comparison import Run
 from asca_deploy.benchmark.timing import Track, silently
 from asca_pillars.base.system import cpu_model, default_threads, package_versions
-from asca_pillars.cli.bench_tables import comparison_table
+from asca_pillars.cli.bench_parts import comparison_table
 from asca_pillars.cli.run_command import run_command
 from asca_pillars.scans.find_scans import find_scans
 from asca_pillars.scans.scan_reader import read_scan

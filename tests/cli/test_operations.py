@@ -11,7 +11,7 @@ import typer
 
 from asca_deploy import Detector, default_bundle_path
 from asca_pillars.base import errors
-from asca_pillars.cli import doctor_checks
+from asca_pillars.cli import doctor
 from asca_pillars.cli.run_command import run_command
 from asca_pillars.scans.scan_reader import write_scan
 from tests.helpers.in_process import run_here
@@ -74,7 +74,7 @@ def test_doctor_as_json_says_whether_the_model_runs() -> None:
         raise errors.BundleError("damaged")
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(doctor_checks, "_bundled_model", broken)
+        patch.setattr(doctor, "_bundled_model", broken)
         done = run_here("doctor")
     assert done.returncode == 1 and "damaged" in done.stdout
 

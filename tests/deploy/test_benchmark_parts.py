@@ -7,8 +7,8 @@ import pytest
 from numpy.typing import NDArray
 
 from asca_deploy import Detector
+from asca_deploy.benchmark import bench_report as process_memory
 from asca_deploy.benchmark import cold, cold_start, measure_roofline, measure_scaling, measure_throughput
-from asca_deploy.benchmark import resident_memory as process_memory
 from asca_deploy.benchmark.roofline import SIZE, gemm_rate
 from asca_deploy.benchmark.scaling import resample
 from asca_deploy.benchmark.throughput import FRAMES

@@ -10,8 +10,15 @@ import onnx
 import pytest
 
 from asca_deploy.bundle import MANIFEST, GraphFile, Parity
-from asca_deploy.layout import difference, layout_of
-from asca_deploy.manifest import bundle_to_json, graph_files, load_bundle, load_pillar_bundle, write_bundle_manifest
+from asca_deploy.manifest import (
+    bundle_to_json,
+    difference,
+    graph_files,
+    layout_of,
+    load_bundle,
+    load_pillar_bundle,
+    write_bundle_manifest,
+)
 from asca_pillars.base.errors import BundleError
 from asca_pillars.ops.pillar.grid import PillarGrid
 from asca_pillars.ops.pillar.prepare import FEATURES

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from asca_deploy.ros2.systemd import Systemd
+from asca_deploy.ros2.health import Systemd
 
 
 @pytest.mark.parametrize("is_abstract", [False, True])
