@@ -58,17 +58,23 @@ def here(monkeypatch: pytest.MonkeyPatch) -> Here:
     return runner
 
 
-def run(scans: Path, out: Path, bundle: Path, address: str = "made-up:1", **options: Any) -> None:
-    with pytest.raises(ScanError, match=r"1 of 40 scans could not be read; they are named in .*unreadable\.jsonl"):
-        detect([scans], out=out, bundle=bundle, cluster=address, **options)
+def run(scans: Path, out: Path, bundle: Path, *, unreadable: int = 1, **options: Any) -> bytes:
+    """Detect on the cluster, where that many of 40 scans cannot be read; the lines."""
+    message = rf"{unreadable} of {SCANS} scans could not be read; they are named in .*unreadable\.jsonl"
+    with pytest.raises(ScanError, match=message):
+        start(scans, out, bundle, **options)
+    return (out / "detections.jsonl").read_bytes()
+
+
+def start(scans: Path, out: Path, bundle: Path, **options: Any) -> None:
+    detect([scans], out=out, bundle=bundle, cluster="made-up:1", **options)
 
 
 def test_shards_become_what_one_process_writes(
     scans: Path, bundle: Path, alone: bytes, here: Here, tmp_path: Path
 ) -> None:
-    run(scans, tmp_path / "out", bundle)
+    assert run(scans, tmp_path / "out", bundle) == alone
     assert [len(shard.items) for shard in here.begun] == [16, 16, 8]
-    assert (tmp_path / "out" / "detections.jsonl").read_bytes() == alone
     (line,) = (tmp_path / "out" / UNREADABLE_FILE).read_text().splitlines()
     assert json.loads(line)["scan"] == str(scans / f"{BAD}.bin") and "4 bytes" in json.loads(line)["error"]
     assert len(alone.splitlines()) == SCANS - 1
@@ -81,24 +87,8 @@ def test_what_is_done_is_not_done_again(scans: Path, bundle: Path, alone: bytes,
     (tmp_path / "out" / "detections.jsonl").unlink()
     here.begun.clear()
     run(scans, tmp_path / "out", bundle)
+    assert run(scans, tmp_path / "out", bundle) == alone
     assert [shard.first for shard in here.begun] == [16]
-    run(scans, tmp_path / "out", bundle)
-    assert len(here.begun) == 1
-    assert (tmp_path / "out" / "detections.jsonl").read_bytes() == alone
-
-
-@pytest.mark.parametrize("kept", ["3 lines", "a part of a line"])
-def test_a_shard_that_was_cut_is_done_again(
-    scans: Path, bundle: Path, alone: bytes, here: Here, tmp_path: Path, kept: str
-) -> None:
-    run(scans, tmp_path / "out", bundle)
-    shard = min((tmp_path / "out" / "shards").glob("*.jsonl"))
-    content = shard.read_bytes()
-    shard.write_bytes(b"".join(content.splitlines(keepends=True)[:3]) if kept == "3 lines" else content[:-40])
-    here.begun.clear()
-    run(scans, tmp_path / "out", bundle)
-    assert [shard.first for shard in here.begun] == [0]
-    assert (tmp_path / "out" / "detections.jsonl").read_bytes() == alone
 
 
 def test_what_tells_of_the_scans_of_a_cluster_does_not_stay_beside_others(
@@ -112,35 +102,21 @@ def test_what_tells_of_the_scans_of_a_cluster_does_not_stay_beside_others(
     assert (out / "shards" / "run.json").is_file()
 
 
-def test_shards_are_not_written_through_a_link(scans: Path, bundle: Path, here: Here, tmp_path: Path) -> None:
-    out = tmp_path / "out"
-    run(scans, out, bundle)
-    (out / "shards").rename(tmp_path / "elsewhere")
-    (out / "shards").symlink_to(tmp_path / "elsewhere")
-    with pytest.raises(OutputError, match="shards: is a link"):
-        detect([scans], out=out, bundle=bundle, cluster="made-up:1")
-
-
-def test_a_folder_of_shards_of_somebody_else_is_left_alone(
+def test_a_folder_of_shards_that_is_a_link_or_somebody_else_s_is_left_alone(
     scans: Path, bundle: Path, here: Here, tmp_path: Path
 ) -> None:
-    detect([scans / "1.bin"], out=tmp_path, bundle=bundle, threads=1, pictures=False)
-    (tmp_path / "shards").mkdir()
-    (tmp_path / "shards" / "glass.txt").write_text("mine")
+    out, elsewhere = tmp_path / "out", tmp_path / "elsewhere"
+    run(scans, out, bundle)
+    shards = (out / "shards").rename(elsewhere)
+    (out / "shards").symlink_to(elsewhere)
+    with pytest.raises(OutputError, match="shards: is a link"):
+        start(scans, out, bundle)
+    (out / "shards").unlink()
+    (out / "shards").mkdir()
+    (out / "shards" / "glass.txt").write_text("mine")
     with pytest.raises(OutputError, match=r"shards: holds glass\.txt and nothing that `asca detect` wrote"):
-        detect([scans], out=tmp_path, bundle=bundle, cluster="made-up:1")
-    assert len(list((tmp_path / "shards").iterdir())) == 1
-
-
-def test_an_archive_may_grow(scans: Path, bundle: Path, here: Here, tmp_path: Path) -> None:
-    grown = Path(shutil.copytree(scans, tmp_path / "scans"))
-    run(grown, tmp_path / "out", bundle)
-    write_scan(grown / "1000.bin", make_scan(1000))
-    here.begun.clear()
-    with pytest.raises(ScanError, match="1 of 41"):
-        detect([grown], out=tmp_path / "out", bundle=bundle, cluster="made-up:1")
-    assert [shard.first for shard in here.begun] == [32]
-    assert len((tmp_path / "out" / "detections.jsonl").read_text().splitlines()) == SCANS
+        start(scans, out, bundle)
+    assert len(list((out / "shards").iterdir())) == 1 and shards.is_dir()
 
 
 def test_scans_of_the_same_names_below_another_folder_are_others(
@@ -154,32 +130,25 @@ def test_scans_of_the_same_names_below_another_folder_are_others(
     assert len(here.begun) == 3
     monkeypatch.chdir(tmp_path / "tuesday")
     with pytest.raises(OutputError, match=r"working_folder = .*monday, now .*tuesday; choose another folder"):
-        detect([Path("scans")], out=tmp_path / "out", bundle=bundle, cluster="made-up:1")
+        start(Path("scans"), tmp_path / "out", bundle)
 
 
 def test_scores_of_classes_reach_the_workers(scans: Path, bundle: Path, here: Here, tmp_path: Path) -> None:
-    for scores in (["Car=0.9", "Cyclist=0.4"], ["Cyclist=0.4", "Car=0.9"]):  # the same run
-        run(scans, tmp_path / "out", bundle, score=scores)
+    scores = ["Cyclist=0.4", "Car=0.9"]
+    for given in (scores, scores[::-1]):  # the same run
+        found = run(scans, tmp_path / "out", bundle, score=given)
     assert len(here.begun) == 3
     with pytest.raises(ScanError, match="1 of 40"):
-        detect(
-            [scans], out=tmp_path / "alone", bundle=bundle, threads=1, pictures=False, score=["Cyclist=0.4", "Car=0.9"]
-        )
-    found, alone = ((tmp_path / name / "detections.jsonl").read_bytes() for name in ("out", "alone"))
-    assert found == alone
+        detect([scans], out=tmp_path / "alone", bundle=bundle, threads=1, pictures=False, score=scores)
+    assert found == (tmp_path / "alone" / "detections.jsonl").read_bytes()
 
 
 def test_another_run_is_refused(scans: Path, bundle: Path, here: Here, tmp_path: Path) -> None:
     run(scans, tmp_path / "out", bundle)
     with pytest.raises(OutputError, match=r"score = None, now 0\.3; choose another folder"):
-        detect([scans], out=tmp_path / "out", bundle=bundle, cluster="made-up:1", score=["0.3"])
-    other = write_bundle(tmp_path / "other", uses_counts=False)
+        start(scans, tmp_path / "out", bundle, score=["0.3"])
     with pytest.raises(OutputError, match="bundle_sha256 = "):
-        detect([scans], out=tmp_path / "out", bundle=other, cluster="made-up:1")
-    (tmp_path / "mine").mkdir()
-    (tmp_path / "mine" / "shards").write_text("mine")
-    with pytest.raises(OutputError, match="nothing that `asca detect` wrote"):
-        detect([scans], out=tmp_path / "mine", bundle=bundle, cluster="made-up:1")
+        start(scans, tmp_path / "out", write_bundle(tmp_path / "other", uses_counts=False))
 
 
 def test_relative_paths_are_those_of_the_command(
@@ -219,81 +188,58 @@ def test_a_scan_that_ends_its_worker_is_a_line(
             yield here.done(shard)
 
     here.end = end
-    with pytest.raises(ScanError, match="2 of 40"):
-        detect([scans], out=tmp_path / "out", bundle=bundle, cluster="made-up:1")
-    lines = [line for line in alone.decode().splitlines() if json.loads(line)["scan"] != deadly]
-    assert (tmp_path / "out" / "detections.jsonl").read_text().splitlines() == lines
+    lines = [line for line in alone.splitlines() if json.loads(line)["scan"] != deadly]
+    assert run(scans, tmp_path / "out", bundle, unreadable=2).splitlines() == lines
     assert "ended the process" in (tmp_path / "out" / UNREADABLE_FILE).read_text()
     assert len(list((tmp_path / "out" / "shards").glob("*.jsonl"))) == 3, "the halves have become the shard"
 
 
-def test_an_error_that_nobody_foresaw_is_a_line(
+def test_an_error_that_nobody_foresaw_is_a_line_and_a_bad_moment_of_the_mount_is_waited_out(
     scans: Path, bundle: Path, here: Here, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def fail(path: Path, **options: Any) -> Any:
-        if path.name == "3.bin":
-            raise ZeroDivisionError("a bug")
-        return read_scan(path, **options)
-
-    monkeypatch.setattr(f"{archive.__name__}.read_scan", fail)
-    with pytest.raises(ScanError, match="2 of 40"):
-        detect([scans], out=tmp_path / "out", bundle=bundle, cluster="made-up:1")
-    assert '{"error": "ZeroDivisionError: a bug"' in (tmp_path / "out" / UNREADABLE_FILE).read_text()
-
-
-def test_a_bad_moment_of_the_mount_is_waited_out(
-    scans: Path, bundle: Path, alone: bytes, here: Here, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     tries = Counter[str]()
 
-    def fail_at_first(path: Path, **options: Any) -> Any:
+    def fail(path: Path, **options: Any) -> Any:
         tries[path.name] += 1
+        if path.name == "2.bin":
+            raise ZeroDivisionError("a bug")
         if path.name in ("3.bin", "4.bin") and tries[path.name] < 3 + (path.name == "4.bin"):
             raise ScanError(f"{path}: cannot be read") from OSError(errno.EIO, "Input/output error")
         return read_scan(path, **options)
 
     monkeypatch.setattr(archive, "READ_AGAIN_AFTER_S", (0.0, 0.0))
-    monkeypatch.setattr(f"{archive.__name__}.read_scan", fail_at_first)
-    with pytest.raises(ScanError, match="2 of 40"):
-        detect([scans], out=tmp_path / "out", bundle=bundle, cluster="made-up:1")
-    assert (tries["3.bin"], tries["4.bin"], tries[f"{BAD}.bin"]) == (3, 3, 1)
-    assert "4.bin: cannot be read" in (tmp_path / "out" / UNREADABLE_FILE).read_text()
+    monkeypatch.setattr(f"{archive.__name__}.read_scan", fail)
+    run(scans, tmp_path / "out", bundle, unreadable=3)
+    assert [tries[name] for name in ("2.bin", "3.bin", "4.bin", f"{BAD}.bin")] == [1, 3, 3, 1]
+    unreadable = (tmp_path / "out" / UNREADABLE_FILE).read_text()
+    assert '{"error": "ZeroDivisionError: a bug"' in unreadable and "4.bin: cannot be read" in unreadable
 
 
-def test_a_machine_that_does_not_see_the_scans_ends_the_run(
-    scans: Path, bundle: Path, here: Here, tmp_path: Path
+@pytest.mark.parametrize("what", ["scans", "bundle"])
+def test_a_machine_that_is_not_set_up_alike_ends_the_run(
+    scans: Path, bundle: Path, here: Here, tmp_path: Path, what: str
 ) -> None:
     """Instead of a line for each scan that says it were not there."""
-    moved = Path(shutil.copytree(scans, tmp_path / "scans"))
+    scans, bundle = (Path(shutil.copytree(path, tmp_path / path.name)) for path in (scans, bundle))
 
     def end(shard: Shard) -> Iterator[Outcome[Any]]:
-        moved.rename(tmp_path / "not mounted")
+        if what == "scans":
+            scans.rename(tmp_path / "not mounted")
+        else:
+            (bundle / "bundle.json").write_text((bundle / "bundle.json").read_text() + "\n")
         yield here.done(shard)
 
     here.end = end
-    with pytest.raises(ClusterError, match=r"does not see .*scans; mount it on every machine"):
-        detect([moved], out=tmp_path / "out", bundle=bundle, cluster="made-up:1")
+    message = "does not see .*scans; mount it on every machine" if what == "scans" else "is another bundle"
+    with pytest.raises(ClusterError if what == "scans" else BundleError, match=message):
+        start(scans, tmp_path / "out", bundle)
     assert not list((tmp_path / "out" / "shards").glob("*.jsonl"))
 
 
-def test_a_machine_with_another_bundle_ends_the_run(scans: Path, bundle: Path, here: Here, tmp_path: Path) -> None:
-    own = Path(shutil.copytree(bundle, tmp_path / "own"))
-    manifest = own / "bundle.json"
-
-    def end(shard: Shard) -> Iterator[Outcome[Any]]:
-        manifest.write_text(manifest.read_text() + "\n")
-        yield here.done(shard)
-
-    here.end = end
-    with pytest.raises(BundleError, match="is another bundle"):
-        detect([scans], out=tmp_path / "out", bundle=own, cluster="made-up:1")
-
-
-def test_options_that_do_not_go_together_are_named(scans: Path, here: Here, tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="--pictures"):
-        detect([scans], out=tmp_path, cluster="made-up:1", pictures=True)
-    with pytest.raises(ConfigError, match="--provider auto"):
-        detect([scans], out=tmp_path, cluster="made-up:1", provider="auto")
+def test_options_that_do_not_go_together_are_named(scans: Path, bundle: Path, here: Here, tmp_path: Path) -> None:
+    for options in ({"pictures": True}, {"provider": "auto"}):
+        with pytest.raises(ConfigError, match=f"--{next(iter(options))}"):
+            start(scans, tmp_path, bundle, **options)
     assert not list(tmp_path.iterdir())
 
 

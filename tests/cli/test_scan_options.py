@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from typer.testing import CliRunner, Result
 
 from asca_deploy import sample_scan_path
-from asca_pillars.base.errors import AscaError, ConfigError, ScanError
+from asca_pillars.base.errors import AscaError, ScanError
 from asca_pillars.cli.main import app
 from asca_pillars.cli.options import scan_settings
 from asca_pillars.scans.mounting import Mounting
@@ -152,9 +152,3 @@ def test_wrong_options(options: dict[str, Any], message: str) -> None:
     unset = {"sensor_height": None, "axes": "x-forward", "pose": None, "reflectance_scale": "auto", "columns": None}
     with pytest.raises(AscaError, match=message):
         ScanInput(scan_settings(**(unset | options)), [sample_scan_path()])
-
-
-def test_bench_does_not_mix_passes_and_matrix() -> None:
-    result = CliRunner().invoke(app, ["bench", "--around", "--matrix"])
-    assert isinstance(result.exception, ConfigError)
-    assert "single passes" in str(result.exception)
