@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
@@ -11,7 +12,7 @@ from asca_deploy import sample_scan_path
 from asca_deploy.result_files import ResultWriter
 from asca_pillars.base.errors import OutputError, ScanError
 from asca_pillars.cli.detect import detect
-from asca_pillars.data.kitti import KittiSplit
+from asca_pillars.data.kitti import KittiSplit, read_labels
 from asca_pillars.scans.scan_reader import read_scan, write_scan
 from tests.helpers.scenes import write_dataset
 
@@ -166,24 +167,23 @@ def test_nothing_readable_is_an_error(tmp_path: Path) -> None:
         detect([tmp_path], out=tmp_path / "out", threads=1)
 
 
-def test_an_image_that_cannot_be_read_is_said(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    root = write_dataset(tmp_path / "kitti", 1)
-    image = KittiSplit(root).image_path("000000")
-    image.parent.mkdir()
-    image.write_bytes(b"no picture")
-    detect([KittiSplit(root).scan_path("000000")], out=tmp_path / "out", threads=1)
-    assert "000000.png: cannot be read as an image" in " ".join(capfd.readouterr().out.split())
-
-
-def test_a_damaged_calibration_is_said_and_the_scans_are_detected(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    split = KittiSplit(write_dataset(tmp_path / "kitti", 3))
-    split.calib_path("000001").write_text("P2: 1 2\n")
-    detect([split.scan_path("000000").parent], out=tmp_path / "out", threads=1)
-    output = " ".join(capsys.readouterr().out.split())
-    assert "no KITTI text is written: " in output and "000001.txt: " in output
-    written = {path.name for path in (tmp_path / "out").iterdir()}
-    assert written >= {"000000.txt", "000001.json", "000001_bev.png", "000002.txt"} and "000001.txt" not in written
-    lines = (tmp_path / "out" / "detections.jsonl").read_text().splitlines()
-    assert [Path(json.loads(line)["scan"]).name for line in lines] == ["000000.bin", "000001.bin", "000002.bin"]
+def test_what_lies_beside_a_scan_is_used_or_said(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    """A calibration becomes KITTI text, and with an image a picture of the boxes in it."""
+    split, out = KittiSplit(write_dataset(tmp_path / "kitti", 4)), tmp_path / "out"
+    split.image_path("000000").parent.mkdir()
+    cv2.imwrite(str(split.image_path("000000")), np.full((375, 1242, 3), 90, np.uint8))
+    split.image_path("000001").write_bytes(b"no picture")
+    split.calib_path("000002").write_text("P2: 1 2\n")
+    split.calib_path("000003").unlink()
+    detect([split.scan_path("000000").parent], out=out, threads=1, score=["0.02"])
+    output, names = " ".join(capfd.readouterr().out.split()), {path.name for path in out.iterdir()}
+    assert "000001.png: cannot be read as an image" in output
+    assert names >= {"000000.txt", "000000_image.png", "000001.txt", "000002.json", "000002_bev.png", "000003.json"}
+    assert not names & {"000001_image.png", "000002.txt", "000003.txt"}
+    for item in read_labels(out / "000000.txt"):
+        assert item.score is not None and 0 <= item.bbox[0] < item.bbox[2] <= 1242
+    lines = (out / "detections.jsonl").read_text().splitlines()
+    assert [Path(json.loads(line)["scan"]).stem for line in lines] == list(split.frame_ids)
+    detect([split.scan_path("000002")], out=out, threads=1)  # of several remarks the first is said
+    output = " ".join(capfd.readouterr().out.split())
+    assert "no KITTI text is written: " in output and "000002.txt: " in output

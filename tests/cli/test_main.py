@@ -3,10 +3,8 @@
 import json
 import os
 import shutil
-import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import cv2
@@ -20,7 +18,6 @@ from asca_deploy import Detector, sample_scan_path
 from asca_pillars.base.installation import install_command
 from asca_pillars.base.schema import to_dict
 from asca_pillars.cli.main import app
-from asca_pillars.data.kitti import KittiSplit, read_labels
 from asca_pillars.scans.scan_reader import read_scan, write_scan
 from tests.helpers.in_process import run_here
 from tests.helpers.scenes import make_scene, write_dataset
@@ -96,31 +93,6 @@ def test_detect_finds_boxes_in_the_sample_without_torch(tmp_path: Path) -> None:
     assert np.asarray(cv2.imread(str(out / "street_bev.png"))).shape[1] >= 500
 
 
-def test_detect_writes_kitti_text_and_overlays_where_there_is_a_calibration(tmp_path: Path) -> None:
-    root = write_dataset(tmp_path / "kitti", 3)
-    split = KittiSplit(root)
-    split.image_path("000001").parent.mkdir()
-    cv2.imwrite(str(split.image_path("000001")), np.full((375, 1242, 3), 90, np.uint8))
-    split.calib_path("000002").unlink()
-    result = asca("detect", root / "training" / "velodyne", "--out", tmp_path / "out", "--score", 0.02)
-    assert result.returncode == 0, result.stderr
-    names = {path.name for path in (tmp_path / "out").iterdir()}
-    assert {"000000.txt", "000001.txt", "000001_image.png"} <= names
-    assert "000002.txt" not in names and "000000_image.png" not in names
-    for frame_id in ("000000", "000001"):
-        for item in read_labels(tmp_path / "out" / f"{frame_id}.txt"):
-            assert item.score is not None and 0 <= item.bbox[0] < item.bbox[2] <= 1242
-
-
-def test_bench_reports_stages_and_machine(tmp_path: Path) -> None:
-    result = asca("bench", "--rounds", 2, "--json", tmp_path / "report.json")
-    assert result.returncode == 0, result.stderr
-    report = json.loads((tmp_path / "report.json").read_text())
-    assert set(report["stages_ms"]) == {"input", "pillarize", "encode", "tables", "neck+head", "decode"}
-    assert report["fps"] == pytest.approx(1000 / report["total_ms"]["p50"])
-    assert report["cpu"] and report["threads"] >= 1 and report["cold_ms"] > 0
-
-
 def test_doctor_names_the_missing_extras() -> None:
     result = asca("doctor")
     assert result.returncode == 0, result.stderr
@@ -147,10 +119,13 @@ def test_detect_refuses_bad_scans_in_one_line(tmp_path: Path, name: str, content
 
 def test_detect_refuses_what_is_not_there(tmp_path: Path) -> None:
     assert "no such file or folder" in refusal(asca("detect", tmp_path / "none.bin"))
-    assert "bundle.json" in refusal(run_here("detect", "--bundle", tmp_path, cwd=tmp_path))
-    assert "unknown provider 'gpu'" in refusal(run_here("detect", "--provider", "gpu", cwd=tmp_path))
-    assert "unknown precision 'half'" in refusal(run_here("detect", "--precision", "half", cwd=tmp_path))
-    assert "threads" in refusal(run_here("detect", "--threads", 0, cwd=tmp_path))
+    for option, value, message in (
+        ("--bundle", tmp_path, "bundle.json"),
+        ("--provider", "gpu", "unknown provider 'gpu'"),
+        ("--precision", "half", "unknown precision 'half'"),
+        ("--threads", 0, "threads"),
+    ):
+        assert message in refusal(run_here("detect", option, value, cwd=tmp_path))
 
 
 def test_a_scan_without_points_gives_no_boxes(tmp_path: Path) -> None:
@@ -187,7 +162,7 @@ def test_export_refuses_what_is_no_checkpoint(tmp_path: Path) -> None:
 
 
 def test_from_training_to_boxes(tmp_path: Path) -> None:
-    """train, export, detect: every command takes what the one before it wrote; a killed export leaves nothing."""
+    """train, export, detect: every command takes what the one before it wrote."""
     data = write_dataset(tmp_path / "data", 4)
     (tmp_path / "config.yaml").write_text(yaml.safe_dump(to_dict(CONFIG)))
     run, bundle = tmp_path / "run", tmp_path / "bundle"
@@ -197,15 +172,6 @@ def test_from_training_to_boxes(tmp_path: Path) -> None:
     for seed in range(8):
         write_scan(scans / f"{seed}.bin", make_scene(seed)[0])
     export = ("export", run / "checkpoints" / "last.ckpt", "-o", bundle, "--scans", scans)
-
-    command = [sys.executable, "-c", "from asca_pillars.cli.main import main; main()", *map(str, export)]
-    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    while not list(tmp_path.glob(".bundle.asca-*")):
-        assert process.poll() is None, "the export ended before it could be killed"
-        time.sleep(0.01)
-    os.kill(process.pid, signal.SIGKILL)
-    process.wait()
-    assert not bundle.exists()
 
     assert "Pedestrain: no such class; there are" in refusal(run_here(*export, "--score", "Pedestrain=0.2"))
     assert "such as Car=0.35" in refusal(run_here(*export, "--score", "Car:0.2"))

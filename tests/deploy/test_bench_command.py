@@ -24,18 +24,8 @@ def _fast_machine(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_all_parts_are_printed_and_written(tiny_bundle: Path, bundle_copy: Path, scan: Points, tmp_path: Path) -> None:
     write_scan(tmp_path / "scan.bin", scan)
     other = shutil.copytree(bundle_copy, tmp_path / "other")
-    options = (
-        "--compare",
-        other,
-        "--matrix",
-        "--scaling",
-        "--stream",
-        "--rounds",
-        1,
-        "--json",
-        tmp_path / "report.json",
-    )
-    output = invoke("bench", tmp_path / "scan.bin", "-b", tiny_bundle, *options)
+    options = ("--compare", other, "--matrix", "--scaling", "--stream", "--json", tmp_path / "report.json")
+    output = invoke("bench", tmp_path / "scan.bin", "-b", tiny_bundle, "--rounds", 1, *options)
     for text in ("neck+head", "outside the graphs", "roofline", "times as fast", "precision", "stream", "pillars"):
         assert text in output
     report = json.loads((tmp_path / "report.json").read_text())
