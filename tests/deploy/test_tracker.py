@@ -5,7 +5,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from asca_deploy.tracker import Tracker
+from asca_deploy import find_bundle
+from asca_deploy.manifest import load_bundle
+from asca_deploy.open_model import track_thresholds
+from asca_deploy.tracker import WEAK_SHARE, Tracker
 from asca_pillars.base.errors import ConfigError
 from asca_pillars.detection.detections import Detections
 
@@ -167,3 +170,13 @@ def test_wrong_poses_and_times_are_refused() -> None:
             Tracker()(found(), 0.0, shifted)
     with pytest.raises(ConfigError, match="time nan"):
         Tracker()(found(), float("nan"))
+
+
+def test_tracks_begin_at_the_thresholds_and_go_on_below_the_lowest() -> None:
+    own = {one.name: one.score_threshold for one in load_bundle(find_bundle(None)).spec.classes}
+    births, least = track_thresholds(None)
+    assert births == own and least == pytest.approx(WEAK_SHARE * min(own.values()))
+    births, least = track_thresholds(None, {"Car": 0.1})
+    assert births == own | {"Car": 0.1} and least == pytest.approx(WEAK_SHARE * 0.1)
+    with pytest.raises(ConfigError, match="Tram"):
+        track_thresholds(None, {"Tram": 0.5})
