@@ -24,27 +24,20 @@ from asca_pillars.models.checkpoint import Checkpoint
 from asca_pillars.scans.scan_reader import read_scan, write_scan
 from tests.cli.eval_runs import evaluate, refusal
 from tests.helpers.gallery_cards import cards, title
+from tests.helpers.hidden_modules import hiding
 from tests.helpers.in_process import invoke
 from tests.helpers.saved_checkpoint import save_checkpoint
 from tests.helpers.scenes import SPEC
 from tests.helpers.tiny_run import CONFIG
 
-BASE_INSTALL = """
-import sys
-from importlib.machinery import PathFinder
+BASE_INSTALL = hiding(
+    "torch lightning numba sklearn scipy matplotlib pandas",
+    """
 from pathlib import Path
-
-class BaseInstall(PathFinder):
-    @classmethod
-    def find_spec(cls, name, *rest):
-        if name.split(".")[0] in ("torch", "lightning", "numba", "sklearn", "scipy", "matplotlib", "pandas"):
-            return None
-        return super().find_spec(name, *rest)
-
-sys.meta_path = [BaseInstall if finder is PathFinder else finder for finder in sys.meta_path]
 from asca_pillars.cli.eval import evaluate
 evaluate(predictions=Path("det"), labels=Path("gt"), out=Path("out"))
-"""
+""",
+)
 
 
 def test_two_folders_of_text(tmp_path: Path, texts: dict[str, Any], capsys: pytest.CaptureFixture[str]) -> None:

@@ -19,27 +19,13 @@ from asca_pillars.base.installation import install_command
 from asca_pillars.base.schema import to_dict
 from asca_pillars.cli.main import app
 from asca_pillars.scans.scan_reader import read_scan, write_scan
+from tests.helpers.hidden_modules import hiding
 from tests.helpers.in_process import run_here
 from tests.helpers.scenes import make_scene, write_dataset
 from tests.helpers.tiny_run import CONFIG
 
-WITHOUT_TORCH = """
-import sys
-from importlib.machinery import PathFinder
-
-class BaseInstall(PathFinder):
-    @classmethod
-    def find_spec(cls, name, *rest):
-        heavy = {"torch", "lightning", "onnx", "onnxscript", "tensorboard", "sklearn", "scipy"}
-        heavy |= {"matplotlib", "openvino", "rosbags", "mcap", "rerun"}
-        if name.split(".")[0] in heavy:
-            return None
-        return super().find_spec(name, *rest)
-
-sys.meta_path = [BaseInstall if finder is PathFinder else finder for finder in sys.meta_path]
-from asca_pillars.cli.main import main
-main()
-"""
+HEAVY = "torch lightning onnx onnxscript tensorboard sklearn scipy matplotlib openvino rosbags mcap rerun"
+WITHOUT_TORCH = hiding(HEAVY, "from asca_pillars.cli.main import main\nmain()")
 
 
 def asca(*arguments: object, cwd: Path | None = None, code: str = WITHOUT_TORCH) -> subprocess.CompletedProcess:
@@ -174,7 +160,6 @@ def test_from_training_to_boxes(tmp_path: Path) -> None:
     export = ("export", run / "checkpoints" / "last.ckpt", "-o", bundle, "--scans", scans)
 
     assert "Pedestrain: no such class; there are" in refusal(run_here(*export, "--score", "Pedestrain=0.2"))
-    assert "such as Car=0.35" in refusal(run_here(*export, "--score", "Car:0.2"))
     exported = run_here(*export, "--score", "Pedestrian=0.21", "--with-weights")
     assert exported.returncode == 0, exported.stderr
     assert (bundle / "weights.ckpt").read_bytes() == (run / "checkpoints" / "weights.ckpt").read_bytes()
@@ -184,9 +169,6 @@ def test_from_training_to_boxes(tmp_path: Path) -> None:
         file.write(b"bits")
     torn = run_here("export", tmp_path / "torn", "-o", tmp_path / "of_torn", "--scans", scans)
     assert "weights.ckpt: is damaged, or of another bundle" in refusal(torn)
-    golden = ("export", bundle, "--golden", "-o", tmp_path / "golden")
-    assert run_here(*golden).returncode == 0
-    assert "--with-weights is for a checkpoint" in refusal(run_here(*golden, "--with-weights"))
     assert "parity on 8 scans" in exported.stdout
     manifest = json.loads((bundle / "bundle.json").read_text())
     assert manifest["provenance"]["command"].startswith("asca train")

@@ -109,15 +109,12 @@ def test_a_signed_layout_that_does_not_follow_from_the_spec(bundle_copy: Path, m
         (lambda data: data.update(schema_version=True), "`schema_version` is"),
         (lambda data: data.update(schema_version=1), "schema_version 1 is no longer read"),
         (lambda data: data["spec"]["grid"].update(zones=9), "zones 9 must lie between 1 and 5"),
-        (lambda data: data["pillar"].update(channels="many"), r"`pillar\.channels` = 'many'"),
         (lambda data: data["pillar"].update(channels=True), r"`pillar\.channels` = true: input should be a number"),
-        (lambda data: data["pillar"].update(channels="8"), r"`pillar\.channels` is missing or of the wrong type"),
         (lambda data: data["expected_input"].update(ground_z_m=[1.0, -1.0]), r"ground_z_m = .* lowest and highest"),
         (lambda data: data["spec"].pop("post"), r"`spec\.post` is missing"),
         (lambda data: data["graphs"].pop("encoder"), "graphs encoder and backbone, not backbone"),
         (lambda data: data["graphs"]["encoder"].update(sha256="0\x1b[31m"), r"sha256 .* is no SHA-256"),
         (lambda data: data["provenance"].update(weights_sha256="0" * 63), "sha256 .* of the weights is no SHA-256"),
-        (lambda data: data["expected_input"].update(ground_z_m=[1.0]), r"expected_input\.ground_z_m"),
     ],
 )
 def test_wrong_keys_and_values(bundle_copy: Path, change: Callable[[dict[str, Any]], object], message: str) -> None:

@@ -45,7 +45,8 @@ class Running:
         self.answers: list[tuple[Stamp, Detections | Tracks]] = []
         self.events: list[dict[str, Any]] = []
         self.mountings: list[Mounting] = []
-        self.came = threading.Semaphore(0)
+        self.came, self.entered, self.free = threading.Semaphore(0), threading.Event(), threading.Event()
+        self.free.set()
         self.live = LiveDetection(
             self._open(bundle),
             reading or ScanSettings(),
@@ -61,6 +62,8 @@ class Running:
         return lambda mounting: self.mountings.append(mounting) or Detector(bundle, threads=1, mounting=mounting)
 
     def _answer(self, stamp: Stamp, found: Detections | Tracks) -> None:
+        self.entered.set()
+        self.free.wait(20)
         self.answers.append((stamp, found))
         self.came.release()
 
@@ -114,24 +117,17 @@ def test_no_points_not_numbers_and_other_fields(tiny_bundle: Path, scan: NDArray
 
 def test_the_oldest_scan_gives_way(tiny_bundle: Path, scan: NDArray[np.float32]) -> None:
     running = Running(tiny_bundle)
-    hold, entered = threading.Event(), threading.Event()
-
-    def held(stamp: Stamp, found: Detections | Tracks) -> None:
-        entered.set()
-        hold.wait(20)
-        running.answers.append((stamp, found))
-
-    running.live._answer = held
+    running.free.clear()
     running.live.enqueue(cloud(scan, 0))
-    assert entered.wait(20)
+    assert running.entered.wait(20)
     for sec in range(1, 11):
         running.live.enqueue(cloud(scan, sec))
     assert running.live.busy_s() > 0
     dropped = running.live.health.dropped
     assert dropped >= 6
-    hold.set()
-    while len(running.answers) < 11 - dropped:
-        assert running.thread.is_alive()
+    running.free.set()
+    for _ in range(11 - dropped):
+        assert running.came.acquire(timeout=20)
     running.end()
     seconds = [stamp.sec for stamp, _ in running.answers]
     assert seconds[0] == 0 and seconds[-1] == 10 and seconds == sorted(seconds)
