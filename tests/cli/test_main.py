@@ -88,18 +88,10 @@ def test_doctor_names_the_missing_extras() -> None:
     assert "auto takes cpu int8" in result.stdout
 
 
-@pytest.mark.parametrize(
-    ("name", "content", "message"),
-    [
-        ("truncated.bin", b"\0" * 30, "truncated.bin"),
-        ("empty.bin", b"", "empty"),
-        ("scan.las", b"x", "unknown suffix '.las'"),
-        ("bad.pcd", b"VERSION .7\nFIELDS a b\n", "bad.pcd"),
-    ],
-)
-def test_detect_refuses_bad_scans_in_one_line(tmp_path: Path, name: str, content: bytes, message: str) -> None:
-    (tmp_path / name).write_bytes(content)
-    assert message in refusal(run_here("detect", tmp_path / name, cwd=tmp_path))
+def test_detect_refuses_bad_scans_in_one_line(tmp_path: Path) -> None:
+    for name, message in (("truncated.bin", "truncated.bin: 1 byte"), ("scan.las", "unknown suffix '.las'")):
+        (tmp_path / name).write_bytes(b"x")
+        assert message in refusal(run_here("detect", tmp_path / name, cwd=tmp_path))
     assert not (tmp_path / "detections").exists()
 
 
@@ -137,14 +129,6 @@ def test_train_refuses_typos_and_missing_data(tmp_path: Path) -> None:
     assert "did you mean `batch_size`?" in refusal(run_here(*command, "-s", "train.batchsize=2"))
     assert "velodyne" in refusal(run_here(*command))
     assert not (tmp_path / "run").exists()
-
-
-def test_export_refuses_what_is_no_checkpoint(tmp_path: Path) -> None:
-    assert "no such checkpoint" in refusal(run_here("export", tmp_path / "none.ckpt", "-o", tmp_path / "b"))
-    (tmp_path / "damaged.ckpt").write_bytes(b"not a checkpoint")
-    assert "damaged.ckpt: not a checkpoint" in refusal(
-        run_here("export", tmp_path / "damaged.ckpt", "-o", tmp_path / "b")
-    )
 
 
 def test_from_training_to_boxes(tmp_path: Path) -> None:
