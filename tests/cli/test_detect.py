@@ -39,7 +39,12 @@ def test_a_damaged_scan_is_named_and_the_others_are_detected(
     (tmp_path / "mix" / "\x1b[31m\n2.bin").write_bytes(b"torn")
     with pytest.raises(ScanError, match=r"1 of 3 scans could not be read"):
         detect([tmp_path / "mix"], out=tmp_path / "out", threads=1, pictures=False)
+    for name in ("1.bin", "2.bin"):
+        write_scan(tmp_path / "torn" / name, POINTS)
+        (tmp_path / "torn" / name).write_bytes(b"torn")
     captured = capsys.readouterr()
+    with pytest.raises(ScanError, match="none of the 2 scans can be read"):
+        detect([tmp_path / "torn"], out=tmp_path / "none", threads=1)
     assert r"\x1b[31m\n2.bin: 4 bytes" in captured.err and "3.bin" in captured.out
     assert {path.name for path in (tmp_path / "out").iterdir()} == {"1.json", "3.json", "detections.jsonl"}
 
@@ -67,14 +72,12 @@ def test_a_folder_of_other_files_is_refused_and_one_of_an_earlier_run_is_not(tmp
     for name in ("1.bin", "2.bin"):
         write_scan(tmp_path / "scans" / name, POINTS)
     (tmp_path / "mine").mkdir()
-    (tmp_path / "mine" / "1.json").write_text("mine")
-    with pytest.raises(OutputError, match=r"holds 1\.json and nothing that `asca detect` wrote"):
-        detect([tmp_path / "scans" / "1.bin"], out=tmp_path / "mine", threads=1)
-    assert (tmp_path / "mine" / "1.json").read_text() == "mine"
-    (tmp_path / "mine" / "1.json").unlink()
-    (tmp_path / "mine" / "detections.jsonl").write_text('{"mine": 1}')
-    with pytest.raises(OutputError, match=r"holds detections\.jsonl and nothing that `asca detect` wrote"):
-        detect([tmp_path / "scans" / "1.bin"], out=tmp_path / "mine", threads=1)
+    for name, content in (("1.json", "mine"), ("detections.jsonl", '{"mine": 1}')):
+        (tmp_path / "mine" / name).write_text(content)
+        with pytest.raises(OutputError, match=rf"holds {name} and nothing that `asca detect` wrote"):
+            detect([tmp_path / "scans" / "1.bin"], out=tmp_path / "mine", threads=1)
+        assert (tmp_path / "mine" / name).read_text() == content
+        (tmp_path / "mine" / name).unlink()
     for scans in (tmp_path / "scans", tmp_path / "scans" / "2.bin"):
         detect([scans], out=tmp_path / "out", threads=1, pictures=False)
     assert {path.name for path in (tmp_path / "out").iterdir()} == {"1.json", "2.json", "detections.jsonl"}
@@ -158,13 +161,6 @@ def test_scans_may_have_the_names_of_other_results(tmp_path: Path) -> None:
     for _ in range(2):
         detect([tmp_path / "scans"], out=tmp_path / "out", threads=1, pictures=False)
     assert json.loads((tmp_path / "out" / "recording.json").read_text())["scan"].endswith("recording.bin")
-
-
-def test_nothing_readable_is_an_error(tmp_path: Path) -> None:
-    for name in ("1.bin", "2.bin"):
-        (tmp_path / name).write_bytes(b"torn")
-    with pytest.raises(ScanError, match="none of the 2 scans can be read"):
-        detect([tmp_path], out=tmp_path / "out", threads=1)
 
 
 def test_what_lies_beside_a_scan_is_used_or_said(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:

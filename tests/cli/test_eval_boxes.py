@@ -30,9 +30,8 @@ def root(tmp_path: Path) -> Path:
 def perfect(root: Path) -> Path:
     """The labels of all frames as predictions, written as elsewhere."""
     path = root.parent / "found.jsonl"
-    frames = read_frames(root / "labels.jsonl")
-    lines = (json_line(f"/data/{f.scan}", f.records._replace(scores=f.records.scores * 0 + 0.9)) for f in frames)
-    path.write_text("".join(lines).replace(', "yaw', ', "score": 0.9, "yaw'))
+    lines = (root / "labels.jsonl").read_text().replace('"scan": "', '"scan": "/data/')
+    path.write_text(lines.replace(', "yaw', ', "score": 0.9, "yaw'))
     return path
 
 

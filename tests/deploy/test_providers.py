@@ -33,25 +33,15 @@ GPU = ([TENSORRT, CUDA, CPU], True, True)
 @pytest.mark.parametrize(
     ("machine", "found"),
     [
-        (BARE, [("cpu", "float32")]),
-        (OLD_CPU, [("cpu", "float32"), ("openvino", "float32")]),
-        (
-            GPU,
-            [
-                ("cpu", "float32"),
-                ("cuda", "reduced"),
-                ("cuda", "float32"),
-                ("tensorrt", "reduced"),
-                ("openvino", "reduced"),
-                ("openvino", "float32"),
-            ],
-        ),
+        (BARE, "cpu float32"),
+        (OLD_CPU, "cpu float32, openvino float32"),
+        (GPU, "cpu float32, cuda reduced, cuda float32, tensorrt reduced, openvino reduced, openvino float32"),
     ],
     indirect=["machine"],
 )
 @pytest.mark.usefixtures("machine")
-def test_what_is_available(found: list[tuple[str, str]]) -> None:
-    assert available() == found
+def test_what_is_available(found: str) -> None:
+    assert ", ".join(map(" ".join, available())) == found
 
 
 @pytest.mark.parametrize(
