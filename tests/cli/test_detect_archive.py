@@ -50,122 +50,130 @@ def alone(bundle: Path, scans: Path, tmp_path_factory: pytest.TempPathFactory) -
     return (out / "detections.jsonl").read_bytes()
 
 
+class Cluster(Here):
+    """Detects scans into a folder by shards that run in this process."""
+
+    def __init__(self, scans: Path, bundle: Path, out: Path) -> None:
+        super().__init__()
+        self.scans, self.bundle, self.out = scans, bundle, out
+
+    def run(self, *, unreadable: int = 1, **options: Any) -> bytes:
+        """Detect where that many of 40 scans cannot be read; the lines."""
+        message = rf"{unreadable} of {SCANS} scans could not be read; they are named in .*unreadable\.jsonl"
+        with pytest.raises(ScanError, match=message):
+            self.start(**options)
+        return (self.out / "detections.jsonl").read_bytes()
+
+    def start(self, **options: Any) -> None:
+        detect([self.scans], out=self.out, bundle=self.bundle, cluster="made-up:1", **options)
+
+    @property
+    def shards(self) -> list[Path]:
+        return sorted((self.out / "shards").glob("*.jsonl"))
+
+    @property
+    def unreadable(self) -> str:
+        return (self.out / UNREADABLE_FILE).read_text()
+
+
 @pytest.fixture
-def here(monkeypatch: pytest.MonkeyPatch) -> Here:
-    runner = Here()
-    monkeypatch.setattr(archive, "run_shards", runner)
+def cluster(scans: Path, bundle: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Cluster:
+    made = Cluster(scans, bundle, tmp_path / "out")
+    monkeypatch.setattr(archive, "run_shards", made)
     monkeypatch.setattr(archive, "require", lambda extra: None)
-    return runner
+    return made
 
 
-def run(scans: Path, out: Path, bundle: Path, *, unreadable: int = 1, **options: Any) -> bytes:
-    """Detect on the cluster, where that many of 40 scans cannot be read; the lines."""
-    message = rf"{unreadable} of {SCANS} scans could not be read; they are named in .*unreadable\.jsonl"
-    with pytest.raises(ScanError, match=message):
-        start(scans, out, bundle, **options)
-    return (out / "detections.jsonl").read_bytes()
-
-
-def start(scans: Path, out: Path, bundle: Path, **options: Any) -> None:
-    detect([scans], out=out, bundle=bundle, cluster="made-up:1", **options)
-
-
-def test_shards_become_what_one_process_writes(
-    scans: Path, bundle: Path, alone: bytes, here: Here, tmp_path: Path
-) -> None:
-    assert run(scans, tmp_path / "out", bundle) == alone
-    assert [len(shard.items) for shard in here.begun] == [16, 16, 8]
-    (line,) = (tmp_path / "out" / UNREADABLE_FILE).read_text().splitlines()
-    assert json.loads(line)["scan"] == str(scans / f"{BAD}.bin") and "4 bytes" in json.loads(line)["error"]
+def test_shards_become_what_one_process_writes(cluster: Cluster, alone: bytes) -> None:
+    assert cluster.run() == alone
+    assert [len(shard.items) for shard in cluster.begun] == [16, 16, 8]
+    (line,) = cluster.unreadable.splitlines()
+    assert json.loads(line)["scan"] == str(cluster.scans / f"{BAD}.bin") and "4 bytes" in json.loads(line)["error"]
     assert len(alone.splitlines()) == SCANS - 1
 
 
-def test_what_is_done_is_not_done_again(scans: Path, bundle: Path, alone: bytes, here: Here, tmp_path: Path) -> None:
-    run(scans, tmp_path / "out", bundle)
-    shards = sorted((tmp_path / "out" / "shards").glob("*.jsonl"))
-    shards[1].unlink()
-    (tmp_path / "out" / "detections.jsonl").unlink()
-    here.begun.clear()
-    run(scans, tmp_path / "out", bundle)
-    assert run(scans, tmp_path / "out", bundle) == alone
-    assert [shard.first for shard in here.begun] == [16]
+def test_what_is_done_is_not_done_again(cluster: Cluster, alone: bytes) -> None:
+    cluster.run()
+    cluster.shards[1].unlink()
+    (cluster.out / "detections.jsonl").unlink()
+    cluster.begun.clear()
+    cluster.run()
+    assert cluster.run() == alone
+    assert [shard.first for shard in cluster.begun] == [16]
 
 
-def test_what_tells_of_the_scans_of_a_cluster_does_not_stay_beside_others(
-    scans: Path, bundle: Path, here: Here, tmp_path: Path
-) -> None:
-    out = tmp_path / "out"
-    run(scans, out, bundle)
-    assert (out / UNREADABLE_FILE).stat().st_size
-    detect([scans / "1.bin"], out=out, bundle=bundle, threads=1, pictures=False)
-    assert not (out / UNREADABLE_FILE).exists()
-    assert (out / "shards" / "run.json").is_file()
+def test_what_tells_of_the_scans_of_a_cluster_does_not_stay_beside_others(cluster: Cluster) -> None:
+    cluster.run()
+    assert cluster.unreadable
+    detect([cluster.scans / "1.bin"], out=cluster.out, bundle=cluster.bundle, threads=1, pictures=False)
+    assert not (cluster.out / UNREADABLE_FILE).exists()
+    assert (cluster.out / "shards" / "run.json").is_file()
 
 
-def test_a_folder_of_shards_that_is_a_link_or_somebody_else_s_is_left_alone(
-    scans: Path, bundle: Path, here: Here, tmp_path: Path
-) -> None:
-    out, elsewhere = tmp_path / "out", tmp_path / "elsewhere"
-    run(scans, out, bundle)
-    shards = (out / "shards").rename(elsewhere)
-    (out / "shards").symlink_to(elsewhere)
+def test_a_folder_of_shards_that_is_a_link_or_somebody_else_s_is_left_alone(cluster: Cluster, tmp_path: Path) -> None:
+    cluster.run()
+    shards = cluster.out / "shards"
+    elsewhere = shards.rename(tmp_path / "elsewhere")
+    shards.symlink_to(elsewhere)
     with pytest.raises(OutputError, match="shards: is a link"):
-        start(scans, out, bundle)
-    (out / "shards").unlink()
-    (out / "shards").mkdir()
-    (out / "shards" / "glass.txt").write_text("mine")
+        cluster.start()
+    shards.unlink()
+    shards.mkdir()
+    (shards / "glass.txt").write_text("mine")
     with pytest.raises(OutputError, match=r"shards: holds glass\.txt and nothing that `asca detect` wrote"):
-        start(scans, out, bundle)
-    assert len(list((out / "shards").iterdir())) == 1 and shards.is_dir()
+        cluster.start()
+    assert len(list(shards.iterdir())) == 1 and elsewhere.is_dir()
 
 
 def test_scans_of_the_same_names_below_another_folder_are_others(
-    scans: Path, bundle: Path, here: Here, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    cluster: Cluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for day in ("monday", "tuesday"):
-        shutil.copytree(scans, tmp_path / day / "scans")
+        shutil.copytree(cluster.scans, tmp_path / day / "scans")
     monkeypatch.chdir(tmp_path / "monday")
-    run(Path("scans"), tmp_path / "out", bundle)
-    run(Path("scans"), tmp_path / "out", bundle)
-    assert len(here.begun) == 3
+    cluster.scans = Path("scans")
+    for _ in range(2):
+        cluster.run()
+    assert len(cluster.begun) == 3
     monkeypatch.chdir(tmp_path / "tuesday")
     with pytest.raises(OutputError, match=r"working_folder = .*monday, now .*tuesday; choose another folder"):
-        start(Path("scans"), tmp_path / "out", bundle)
+        cluster.start()
 
 
-def test_scores_of_classes_reach_the_workers(scans: Path, bundle: Path, here: Here, tmp_path: Path) -> None:
+def test_scores_of_classes_reach_the_workers(cluster: Cluster, tmp_path: Path) -> None:
     scores = ["Cyclist=0.4", "Car=0.9"]
     for given in (scores, scores[::-1]):  # the same run
-        found = run(scans, tmp_path / "out", bundle, score=given)
-    assert len(here.begun) == 3
+        found = cluster.run(score=given)
+    assert len(cluster.begun) == 3
     with pytest.raises(ScanError, match="1 of 40"):
-        detect([scans], out=tmp_path / "alone", bundle=bundle, threads=1, pictures=False, score=scores)
+        detect([cluster.scans], out=tmp_path / "alone", bundle=cluster.bundle, threads=1, pictures=False, score=scores)
     assert found == (tmp_path / "alone" / "detections.jsonl").read_bytes()
 
 
-def test_another_run_is_refused(scans: Path, bundle: Path, here: Here, tmp_path: Path) -> None:
-    run(scans, tmp_path / "out", bundle)
+def test_another_run_is_refused(cluster: Cluster, tmp_path: Path) -> None:
+    cluster.run()
     with pytest.raises(OutputError, match=r"score = None, now 0\.3; choose another folder"):
-        start(scans, tmp_path / "out", bundle, score=["0.3"])
+        cluster.start(score=["0.3"])
+    cluster.bundle = write_bundle(tmp_path / "other", uses_counts=False)
     with pytest.raises(OutputError, match="bundle_sha256 = "):
-        start(scans, tmp_path / "out", write_bundle(tmp_path / "other", uses_counts=False))
+        cluster.start()
 
 
 def test_relative_paths_are_those_of_the_command(
-    scans: Path, bundle: Path, here: Here, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    cluster: Cluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A worker has a working directory of its own."""
-    shutil.copytree(scans, tmp_path / "home" / "scans")
-    shutil.copytree(bundle, tmp_path / "home" / "bundle")
+    shutil.copytree(cluster.scans, tmp_path / "home" / "scans")
+    shutil.copytree(cluster.bundle, tmp_path / "home" / "bundle")
     (tmp_path / "elsewhere").mkdir()
     monkeypatch.chdir(tmp_path / "home")
 
     def end(shard: Shard) -> Iterator[Outcome[Any]]:
         with monkeypatch.context() as worker:
             worker.chdir(tmp_path / "elsewhere")
-            yield here.done(shard)
+            yield cluster.done(shard)
 
-    here.end = end
+    cluster.end = end
     named = [Path("scans") / f"{number}.bin" for number in (1, 2)]
     detect(named, out=Path("out"), bundle=Path("bundle"), cluster="made-up:1")
     lines = (tmp_path / "home" / "out" / "detections.jsonl").read_text().splitlines()
@@ -173,10 +181,8 @@ def test_relative_paths_are_those_of_the_command(
     assert not list((tmp_path / "elsewhere").iterdir())
 
 
-def test_a_scan_that_ends_its_worker_is_a_line(
-    scans: Path, bundle: Path, alone: bytes, here: Here, tmp_path: Path
-) -> None:
-    deadly = str(scans / "20.bin")
+def test_a_scan_that_ends_its_worker_is_a_line(cluster: Cluster, alone: bytes) -> None:
+    deadly = str(cluster.scans / "20.bin")
 
     def end(shard: Shard) -> Iterator[Outcome[Any]]:
         if len(shard.items) == 1 and shard.items[0][0] == deadly:
@@ -185,17 +191,17 @@ def test_a_scan_that_ends_its_worker_is_a_line(
             for half in reversed(shard.split):
                 yield from end(half)
         else:
-            yield here.done(shard)
+            yield cluster.done(shard)
 
-    here.end = end
+    cluster.end = end
     lines = [line for line in alone.splitlines() if json.loads(line)["scan"] != deadly]
-    assert run(scans, tmp_path / "out", bundle, unreadable=2).splitlines() == lines
-    assert "ended the process" in (tmp_path / "out" / UNREADABLE_FILE).read_text()
-    assert len(list((tmp_path / "out" / "shards").glob("*.jsonl"))) == 3, "the halves have become the shard"
+    assert cluster.run(unreadable=2).splitlines() == lines
+    assert "ended the process" in cluster.unreadable
+    assert len(cluster.shards) == 3, "the halves have become the shard"
 
 
 def test_an_error_that_nobody_foresaw_is_a_line_and_a_bad_moment_of_the_mount_is_waited_out(
-    scans: Path, bundle: Path, here: Here, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    cluster: Cluster, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     tries = Counter[str]()
 
@@ -209,38 +215,39 @@ def test_an_error_that_nobody_foresaw_is_a_line_and_a_bad_moment_of_the_mount_is
 
     monkeypatch.setattr(archive, "READ_AGAIN_AFTER_S", (0.0, 0.0))
     monkeypatch.setattr(f"{archive.__name__}.read_scan", fail)
-    run(scans, tmp_path / "out", bundle, unreadable=3)
+    cluster.run(unreadable=3)
     assert [tries[name] for name in ("2.bin", "3.bin", "4.bin", f"{BAD}.bin")] == [1, 3, 3, 1]
-    unreadable = (tmp_path / "out" / UNREADABLE_FILE).read_text()
-    assert '{"error": "ZeroDivisionError: a bug"' in unreadable and "4.bin: cannot be read" in unreadable
+    assert (
+        '{"error": "ZeroDivisionError: a bug"' in cluster.unreadable and "4.bin: cannot be read" in cluster.unreadable
+    )
 
 
 @pytest.mark.parametrize("what", ["scans", "bundle"])
-def test_a_machine_that_is_not_set_up_alike_ends_the_run(
-    scans: Path, bundle: Path, here: Here, tmp_path: Path, what: str
-) -> None:
+def test_a_machine_that_is_not_set_up_alike_ends_the_run(cluster: Cluster, tmp_path: Path, what: str) -> None:
     """Instead of a line for each scan that says it were not there."""
-    scans, bundle = (Path(shutil.copytree(path, tmp_path / path.name)) for path in (scans, bundle))
+    cluster.scans = Path(shutil.copytree(cluster.scans, tmp_path / "scans"))
+    cluster.bundle = Path(shutil.copytree(cluster.bundle, tmp_path / "bundle"))
 
     def end(shard: Shard) -> Iterator[Outcome[Any]]:
         if what == "scans":
-            scans.rename(tmp_path / "not mounted")
+            cluster.scans.rename(tmp_path / "not mounted")
         else:
-            (bundle / "bundle.json").write_text((bundle / "bundle.json").read_text() + "\n")
-        yield here.done(shard)
+            with (cluster.bundle / "bundle.json").open("a") as manifest:
+                manifest.write("\n")
+        yield cluster.done(shard)
 
-    here.end = end
+    cluster.end = end
     message = "does not see .*scans; mount it on every machine" if what == "scans" else "is another bundle"
     with pytest.raises(ClusterError if what == "scans" else BundleError, match=message):
-        start(scans, tmp_path / "out", bundle)
-    assert not list((tmp_path / "out" / "shards").glob("*.jsonl"))
+        cluster.start()
+    assert not cluster.shards
 
 
-def test_options_that_do_not_go_together_are_named(scans: Path, bundle: Path, here: Here, tmp_path: Path) -> None:
+def test_options_that_do_not_go_together_are_named(cluster: Cluster) -> None:
     for options in ({"pictures": True}, {"provider": "auto"}):
         with pytest.raises(ConfigError, match=f"--{next(iter(options))}"):
-            start(scans, tmp_path, bundle, **options)
-    assert not list(tmp_path.iterdir())
+            cluster.start(**options)
+    assert not cluster.out.exists()
 
 
 def test_without_ray_it_says_what_to_install(
