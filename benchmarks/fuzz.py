@@ -1,13 +1,15 @@
-"""Fuzzing of every reader: scans, recordings, settings, labels, calibrations, predictions, manifests.
+"""Fuzzing of every reader, and of every file that a command writes and resumes from.
 
     python -m benchmarks.fuzz --minutes 20 --seed 7
 
 Valid small files are changed at random (bits, bytes, numbers; pieces removed, repeated, swapped between files) and
-read as by a command. Reading has to succeed or to raise one AscaError. The exit code is 1 if anything else
-happened; it is printed with the number of the input, and `--first NUMBER --inputs 1` reads that one again.
+read as by a command. Reading has to succeed or to raise one AscaError; a command that resumes from its results has to
+come to those of an undamaged file. Nothing may be written outside the folder of the file. The exit code is 1 if
+anything else happened; it is printed with the number of the input, which `--first NUMBER --inputs 1` reads again.
 """
 
 import math
+import os
 import re
 import signal
 import tempfile
@@ -25,14 +27,15 @@ import numpy as np
 import typer
 from rich.console import Console
 from rich.progress import Progress
-from rich.table import Table
 
 from asca_pillars.base.errors import AscaError
-from asca_pillars.base.files import write_json
 from asca_pillars.cli.run_command import run_command
-from benchmarks.fuzz_inputs import Kind, kinds
+from asca_pillars.evaluation.report_page import markdown_table
+from benchmarks import fuzz_inputs, fuzz_results
+from benchmarks.fuzz_inputs import Kind
 
-OUTCOMES = ("read", "refused", "traceback", "slow", "not finite", "too many points")
+LEFT = "left outside"
+OUTCOMES = ("read", "refused", "traceback", "slow", "not finite", "too many points", LEFT)
 BAD = OUTCOMES[2:]
 SLOW_S = 5.0
 _NUMBER = re.compile(rb"-?\d+(?:\.\d+)?")
@@ -52,27 +55,22 @@ def main(
     inputs: Annotated[int | None, typer.Option(min=1, help="Stop after so many inputs.")] = None,
     seed: Annotated[int, typer.Option(min=0)] = 0,
     first: Annotated[int, typer.Option(min=0, help="Number of the first input.")] = 0,
-    kind: Annotated[str | None, typer.Option(help="Only kinds whose name contains this.")] = None,
-    out: Annotated[Path | None, typer.Option("--json", help="Also write the counts to this file.")] = None,
+    kind: Annotated[str, typer.Option(help="Only kinds whose name contains this.")] = "",
 ) -> None:
     """Read damaged files and count the outcomes."""
-    console = Console(markup=False, highlight=False)
-    start = time.perf_counter()
     with tempfile.TemporaryDirectory(prefix="asca-fuzz-") as folder:
-        counts, failures = fuzz(Path(folder), seed, first, inputs, minutes * 60, kind, console)
-    total = sum(counts.values())
-    table = Table(title=f"{total} inputs, seed {seed}, {time.perf_counter() - start:.0f} s")
-    for column in ("kind", *OUTCOMES):
-        table.add_column(column, justify="left" if column == "kind" else "right")
-    for name in sorted({name for name, _ in counts}):
-        table.add_row(name, *(str(counts[name, outcome]) for outcome in OUTCOMES))
-    console.print(table)
-    for text in failures[:20]:
-        console.print(text)
-    if out is not None:
-        rows = [{"kind": name, "outcome": outcome, "inputs": count} for (name, outcome), count in counts.items()]
-        write_json(out, {"seed": seed, "inputs": total, "counts": rows})
-    raise typer.Exit(int(any(counts[name, outcome] for name, outcome in counts if outcome in BAD)))
+        counts, failures = fuzz(Path(folder), seed, first, inputs, minutes * 60, kind, Console())
+    names = sorted({name for name, _ in counts})
+    rows = [(name, *(str(counts[name, outcome]) for outcome in OUTCOMES)) for name in names]
+    print(f"{sum(counts.values())} inputs, seed {seed}\n\n{markdown_table(('kind', *OUTCOMES), rows, left=1)}")
+    print("\n".join(failures[:20]))
+    raise typer.Exit(int(bool(failures)))
+
+
+def kinds(folder: Path) -> list[Kind]:
+    """Return every kind of input; the files of each are written below `folder`."""
+    below = folder / "some" / "where" / "below"  # paths that lead upwards stay within the compared folder
+    return [*fuzz_inputs.kinds(folder / "inputs"), *fuzz_results.kinds(below)]
 
 
 def fuzz(
@@ -81,7 +79,7 @@ def fuzz(
     first: int = 0,
     inputs: int | None = None,
     seconds: float = math.inf,
-    only: str | None = None,
+    only: str = "",
     console: Console | None = None,
 ) -> tuple[Counter[tuple[str, str]], list[str]]:
     """Read damaged files until `inputs` or `seconds` are over.
@@ -91,8 +89,10 @@ def fuzz(
     Returns:
         how many inputs of each kind had each outcome, and a description of each bad one.
     """
-    chosen = [kind for kind in kinds(folder) if only is None or only in kind.name]
+    chosen = [kind for kind in kinds(folder) if only in kind.name]
     shares = np.array([kind.share for kind in chosen])
+    for kind in chosen:
+        read(kind, kind.seeds[0])  # creates caches on first use
     counts: Counter[tuple[str, str]] = Counter()
     failures: list[str] = []
     end = time.perf_counter() + seconds
@@ -103,15 +103,17 @@ def fuzz(
             rng = np.random.default_rng([seed, number])
             kind = chosen[int(rng.choice(len(chosen), p=shares / shares.sum()))]
             content = damaged(kind, rng)
+            outside = _listing(folder, kind.path.parent)
             outcome, text = read(kind, content)
             if outcome == "slow":  # repeated, since a busy machine may have delayed it
                 outcome, text = read(kind, content)
+            if new := _listing(folder, kind.path.parent) ^ outside:
+                outcome, text = LEFT, repr(sorted(new)[:3])
             counts[kind.name, outcome] += 1
             if outcome in BAD:
                 failures.append(f"input {number}, {kind.name}: {outcome}: {text}")
             number += 1
-            if number % 1000 == 0:
-                progress.update(task, completed=number - first)
+            progress.update(task, completed=number - first)
     return counts, failures
 
 
@@ -182,6 +184,15 @@ def _finite(value: Any) -> bool:
     if isinstance(value, (list, tuple)):
         return all(map(_finite, value))
     return not isinstance(value, float) or math.isfinite(value)
+
+
+def _listing(folder: Path, target: Path) -> set[tuple[str, int]]:
+    """Return every file below a folder with its size, except those below `target`."""
+    found = set()
+    for at, names, files in os.walk(folder):
+        names[:] = [name for name in names if Path(at, name) != target]
+        found |= {(f"{at}/{name}", Path(at, name).lstat().st_size) for name in files}
+    return found
 
 
 @contextmanager

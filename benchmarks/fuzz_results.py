@@ -1,30 +1,15 @@
-"""Fuzzing of files that commands write and read again: journals, shards, pages of bundles, boxes, marks of folders.
-
-    python -m benchmarks.fuzz_results --inputs 40000 --seed 7
-
-Valid small files are changed at random, as by `benchmarks.fuzz`, and given to the function that resumes from them. It
-has to succeed with the result of an undamaged file, or raise one AscaError and leave the file unchanged. Nothing may be
-written outside the folder of the file. The exit code is 1 if anything else happened.
-"""
+"""Results of `benchmarks.fuzz`: files that commands write and resume from or recognize their own folders by."""
 
 import json
-import os
-import tempfile
-import time
-from collections import Counter
 from collections.abc import Callable
 from contextlib import redirect_stdout
 from functools import partial
 from io import StringIO
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
-import typer
 import yaml
-from rich.console import Console
-from rich.progress import Progress
-from rich.table import Table
 
 from asca_deploy import Detections, sample_scan_path, shipped_bundles
 from asca_deploy.browser_page import ORT_FILES, write_page
@@ -37,13 +22,12 @@ from asca_pillars.base.own_files import page_end
 from asca_pillars.base.schema import to_dict
 from asca_pillars.base.system import describe_environment
 from asca_pillars.base.writable_file import require_writable
-from asca_pillars.cli.run_command import run_command
 from asca_pillars.cluster.shards import Shard, ShardFolder
 from asca_pillars.config.tree import Config, load_config
-from asca_pillars.data.boxes.box_records import read_frame_file
 from asca_pillars.data.boxes.box_split import BoxSplit
 from asca_pillars.data.boxes.detector_scope import DetectorScope
 from asca_pillars.data.importing.imported import MARKER, require_own_dataset
+from asca_pillars.data.kitti import write_image_set
 from asca_pillars.evaluation import report_files as eval_files
 from asca_pillars.evaluation.boxes.box_predictions import read_box_predictions
 from asca_pillars.evaluation.tracking.tracking_report import tracking_report
@@ -51,77 +35,16 @@ from asca_pillars.pictures.visualize import png_bytes
 from asca_pillars.scans.scan_reader import read_scan, write_scan
 from asca_pillars.sim.simulation import require_own_frames
 from asca_pillars.training.run_files import YAML_HEAD, require_own_run
-from benchmarks import fuzz
-from benchmarks.fuzz_inputs import LABEL, Kind
-from benchmarks.fuzz_inputs import kinds as input_kinds
+from benchmarks.fuzz_inputs import BOX, Kind
 
-LEFT = "left outside"
-OUTCOMES = (*fuzz.OUTCOMES, LEFT)
-READERS = ("config", "override", "manifest", "labels", "predictions")
-"""Kinds of `benchmarks.fuzz` with which commands read results and settings."""
 CLASSES = ("Car", "Pedestrian")
 ABOUT = {"recording": "drive.mcap", "files": [["drive.mcap", 1, 2]], "topic": "/lidar", "model": {}, "runs_on": "cpu"}
-BOX = {"x_m": 9.5, "y_m": 1, "z_m": -1, "length_m": 4, "width_m": 2, "height_m": 1.5, "yaw_rad": 0.1}
 SCANS = 5
-
-
-def main(
-    inputs: Annotated[int, typer.Option(min=1, help="Stop after so many.")] = 2000,
-    seed: Annotated[int, typer.Option(min=0)] = 0,
-    first: Annotated[int, typer.Option(min=0, help="Number of the first input.")] = 0,
-    kind: Annotated[str | None, typer.Option(help="Only kinds whose name contains this.")] = None,
-) -> None:
-    """Resume from damaged files and count the outcomes."""
-    console = Console(markup=False, highlight=False, width=140)
-    start = time.perf_counter()
-    with tempfile.TemporaryDirectory(prefix="asca-fuzz-") as folder:
-        counts, failures = fuzz_results(Path(folder), seed, inputs, first, kind, console)
-    table = Table(title=f"{sum(counts.values())} inputs, seed {seed}, {time.perf_counter() - start:.0f} s")
-    for column in ("kind", *OUTCOMES):
-        table.add_column(column, justify="left" if column == "kind" else "right")
-    for name in sorted({name for name, _ in counts}):
-        table.add_row(name, *(str(counts[name, outcome]) for outcome in OUTCOMES))
-    console.print(table)
-    for text in failures[:20]:
-        console.print(text)
-    raise typer.Exit(int(bool(failures)))
-
-
-def fuzz_results(
-    folder: Path,
-    seed: int,
-    inputs: int,
-    first: int = 0,
-    only: str | None = None,
-    console: Console | None = None,
-) -> tuple[Counter[tuple[str, str]], list[str]]:
-    """Resume from damaged files; return counts and failures as `fuzz.fuzz`."""
-    place = folder / "some" / "where" / "below"  # paths that lead upwards stay within the compared folder
-    place.mkdir(parents=True)
-    chosen = [kind for kind in kinds(place) if only is None or only in kind.name]
-    shares = np.array([kind.share for kind in chosen])
-    for kind in chosen:
-        fuzz.read(kind, kind.seeds[0])  # creates caches on first use
-    counts: Counter[tuple[str, str]] = Counter()
-    failures: list[str] = []
-    with Progress(console=console, transient=True, disable=console is None) as progress:
-        for number in progress.track(range(first, first + inputs), description="inputs"):
-            rng = np.random.default_rng([seed, number])
-            kind = chosen[int(rng.choice(len(chosen), p=shares / shares.sum()))]
-            outside = _listing(folder, kind.path.parent)
-            outcome, text = fuzz.read(kind, fuzz.damaged(kind, rng))
-            if new := _listing(folder, kind.path.parent) ^ outside:
-                outcome, text = LEFT, repr(sorted(new)[:3])
-            counts[kind.name, outcome] += 1
-            if outcome in (*fuzz.BAD, LEFT):
-                failures.append(f"input {number}, {kind.name}: {outcome}: {text}")
-    return counts, failures
 
 
 def kinds(folder: Path) -> list[Kind]:
     """Return every kind of result that a command resumes from; the files of each are written below `folder`."""
-    readers = [kind for kind in input_kinds(folder / "readers") if kind.name in READERS]
-    return [*readers, *_gone_on_from(folder), *_boxes(folder), _page(folder), *_marks(folder)]
+    return [*_gone_on_from(folder), *_boxes(folder), _page(folder), *_marks(folder)]
 
 
 def _gone_on_from(folder: Path) -> list[Kind]:
@@ -173,43 +96,34 @@ def _gone_on_from(folder: Path) -> list[Kind]:
 
 
 def _boxes(folder: Path) -> list[Kind]:
-    root = folder / "boxes"
+    root, found, tracks = folder / "boxes", folder / "found", folder / "tracks"
     names = [f"{number:06d}" for number in range(2)]
+    records = [{**BOX, "class": name, "score": 0.5, "track_id": number} for number, name in enumerate(("Car", "Truck"))]
+    lines = "".join(json.dumps({"scan": f"{name}.bin", "time_s": 0.5, "boxes": records}) + "\n" for name in names)
     for name in names:
         write_scan(root / "scans" / f"{name}.bin", np.full((8, 4), 0.5, np.float32))
     (root / "dataset.yaml").write_text("labels: labels.jsonl\n")
-    records = [{"class": name, **BOX, "score": 0.5, "track_id": number} for number, name in enumerate(("Car", "Truck"))]
-    lines = [json.dumps({"scan": f"{name}.bin", "time_s": 0.5, "boxes": records}) + "\n" for name in names]
-    (root / "labels.jsonl").write_text("".join(lines))
-    (root / "ImageSets").mkdir()
-    (root / "ImageSets" / "val.txt").write_text("".join(f"{name}\n" for name in names))
+    (root / "labels.jsonl").write_text(lines)
+    write_image_set(root, "val", names)
     split = BoxSplit(root, "val")
-    rows = ",".join(("scan", "class", *BOX, "score")) + "\n000000.bin,Car,9,1,-1,4,2,1.5,0,0.5\n"
-    found, tracks = folder / "found", folder / "tracks"
-    for one in (found, tracks):
-        one.mkdir()
-    (tracks / "detections.jsonl").write_text("".join(lines))
+    found.mkdir()
+    tracks.mkdir()
+    (tracks / "detections.jsonl").write_text(lines)
+    rows = f"scan,{','.join(BOX)},score\n000000.bin,{','.join(map(str, BOX.values()))},0.5\n"
     about = json.dumps({**ABOUT, "classes": ["Car", "Truck"], "ranges_m": [[0, 60], [-30, 30]], "tracks": True})
 
     def predictions(path: Path) -> Any:
         return [frame.found for frame in read_box_predictions(path, split).frames]
 
     def track_scores(path: Path) -> Any:
-        report = tracking_report(split, path.parent, "fuzz", {})
-        return [one.clear.labels for one in report.scores]
+        return [one.clear.labels for one in tracking_report(split, path.parent, "fuzz", {}).scores]
 
     return [
-        Kind("boxes .jsonl", found / "detections.jsonl", ("".join(lines).encode(),), predictions, 2.0),
-        Kind("boxes .csv", found / "boxes.csv", (rows.encode(),), predictions, 2.0),
-        Kind("boxes .json", found / "000000.json", (json.dumps({"boxes": records}).encode(),), read_boxes, 2.0),
-        Kind("tracks", folder / "tracks_of" / "detections.jsonl", ("".join(lines).encode(),), track_scores),
+        Kind("predictions .jsonl", found / "detections.jsonl", (lines.encode(),), predictions, 2.0),
+        Kind("predictions .csv", found / "boxes.csv", (rows.encode(),), predictions, 2.0),
+        Kind("tracks", folder / "tracks_of" / "detections.jsonl", (lines.encode(),), track_scores),
         Kind("recording.json", tracks / "recording.json", (about.encode(),), track_scores),
     ]
-
-
-def read_boxes(path: Path) -> Any:
-    """Read the boxes of a frame's own file."""
-    return read_frame_file(path).boxes
 
 
 def _page(folder: Path) -> Kind:
@@ -254,7 +168,7 @@ def _marks(folder: Path) -> list[Kind]:
     about = json.dumps({"seed": 1, "scene": {}, "lidar": {}, "field_of_view": "full"}).encode()
     environment = json.dumps(describe_environment()).encode()
     mcap = b"\x89MCAP0\r\n\x01\x1e\0\0\0\0\0\0\0\0\0\0\0\x12\0\0\0asca-pillars boxes"
-    found = f"{LABEL} 0.900000\n".replace("0.00 0", "-1 -1").encode()
+    found = b"Car -1 -1 1.85 387.63 181.54 423.81 203.12 1.67 1.87 3.69 -16.53 2.39 58.49 1.57 0.900000\n"
 
     def detect(out: Path) -> None:
         with ResultWriter(out, [Path("1")], pictures=True, scope=DetectorScope((), None)):
@@ -287,12 +201,7 @@ def _marks(folder: Path) -> list[Kind]:
         ("config.yaml", (config, settings.encode()), train, {"environment.json": environment}),
         ("environment.json", (environment,), train, {"config.yaml": config}),
         ("simulation.json", (about,), require_own_frames, {}),
-        (
-            "ImageSets/train.txt",
-            (b"0\n1\n", b"0002/000000\n0002/000001\n"),
-            require_own_frames,
-            {"simulation.json": about},
-        ),
+        ("ImageSets/train.txt", (b"0\n", b"0002/000000\n"), require_own_frames, {"simulation.json": about}),
         ("boxes.mcap", (mcap,), foxglove, {}),
         ("scans.rrd", (b"RRF2\0\0asca-pillars",), rerun, {}),
         ("dataset.yaml", ((MARKER + "labels: labels.jsonl\n").encode(),), require_own_dataset, {}),
@@ -332,16 +241,3 @@ def _keeping(look: Callable[[Path], Any], *, always: bool = False) -> Callable[[
 def _require(holds: bool, reason: str) -> None:
     if not holds:
         raise RuntimeError(reason)
-
-
-def _listing(folder: Path, target: Path) -> set[tuple[str, int]]:
-    """Return every file below a folder with its size, except those below `target`."""
-    found = set()
-    for at, names, files in os.walk(folder):
-        names[:] = [name for name in names if Path(at, name) != target]
-        found |= {(f"{at}/{name}", Path(at, name).lstat().st_size) for name in files}
-    return found
-
-
-if __name__ == "__main__":
-    run_command(main)

@@ -25,7 +25,7 @@ from rich.console import Console
 from rich.progress import Progress
 
 from asca_deploy import Detector, sample_scan_path
-from asca_deploy.benchmark.resident_memory import peak_memory_mib, resident_mib
+from asca_deploy.benchmark.bench_report import peak_memory_mib, resident_mib
 from asca_deploy.providers import Precision, Provider
 from asca_pillars.base.errors import AscaError
 from asca_pillars.base.files import atomic_path

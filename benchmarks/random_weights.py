@@ -2,11 +2,13 @@
 
     python -m benchmarks.random_weights bundles/                                  # the paper's size, K = 3
     asca bench scans/ --bundle bundles/int8 --compare bundles/float32
+    python -m benchmarks.random_weights sparse/ --config asca_sim --neck sparse   # what does a sparse neck gain?
+    python -m benchmarks.random_weights dense/ --config asca_sim --neck dense
+    asca bench scans/ --bundle dense/int8 --compare sparse/int8
 
 The weights are the same on every run. They show neither the accuracy of 8 bits nor the number of boxes.
 """
 
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal, TypeAlias
@@ -19,7 +21,6 @@ from rich.console import Console
 from torch import nn
 
 from asca_deploy import sample_scan_path
-from asca_deploy.bundle import PillarBundle
 from asca_export.bundle_writer import MIN_SCANS, ExportOptions
 from asca_export.pillar.export import export_pillar_bundle
 from asca_pillars.base.errors import ConfigError
@@ -37,28 +38,19 @@ Neck: TypeAlias = Literal["dense", "sparse"]
 def main(
     out: Annotated[Path, typer.Argument(help="Folder for the bundles float32 and int8.")],
     config: Annotated[str, typer.Option(help="YAML, or the name of one that ships.")] = "asca_pointpillars_kitti",
+    neck: Annotated[Neck | None, typer.Option(help="Default: the configuration's.")] = None,
 ) -> None:
     """Export both, calibrated on the sample scan, each time without another eighth of its points."""
     console = Console(markup=False)
     points = read_scan(sample_scan_path()).points
-    model = random_weights(config, points)
-    with console.status("Exporting") as status:
-        for name in ("float32", "int8"):
-            bundle = export_random_weights(model, points, out / name, int8=name == "int8", progress=status.update)
-            console.print(f"{out / name}: {bundle.backbone_gmac:.2f} GMAC, {bundle.precision}")
-
-
-def export_random_weights(
-    model: Checkpoint, points: NDArray[np.float32], out: Path, *, int8: bool, progress: Callable[[str], None]
-) -> PillarBundle:
-    """Export, in 8 bits calibrated on a scan (N, 4), metres, LiDAR frame, each time without another eighth of it."""
+    model = random_weights(config, points, neck)
     thinned = [np.delete(points, slice(part, None, MIN_SCANS), axis=0) for part in range(MIN_SCANS)]
-    return export_pillar_bundle(
-        model,
-        out,
-        [points] * MIN_SCANS,
-        ExportOptions(trained_on="nothing: random weights", calibration=thinned if int8 else None, progress=progress),
-    )
+    with console.status("Exporting") as status:
+        options = ExportOptions(trained_on="nothing: random weights", progress=status.update)
+        for name, calibration in (("float32", None), ("int8", thinned)):
+            chosen = replace(options, calibration=calibration)
+            bundle = export_pillar_bundle(model, out / name, [points] * MIN_SCANS, chosen)
+            console.print(f"{out / name}: {bundle.backbone_gmac:.2f} GMAC, {bundle.precision}")
 
 
 def random_weights(config: str, points: NDArray[np.float32], neck: Neck | None = None) -> Checkpoint:

@@ -1,4 +1,4 @@
-"""A short fuzz run over every reader, and that its judge can tell bad from good."""
+"""A short fuzz run over every reader and over what commands resume from, and that its judge can tell bad from good."""
 
 import time
 from pathlib import Path
@@ -7,21 +7,21 @@ import numpy as np
 import pytest
 
 from benchmarks import fuzz
-from benchmarks.fuzz_inputs import Kind, kinds
+from benchmarks.fuzz_inputs import Kind
 
 
 @pytest.mark.parametrize("seed", [1, 2])
 def test_damaged_input_is_read_or_refused(tmp_path: Path, seed: int) -> None:
-    counts, failures = fuzz.fuzz(tmp_path, seed, inputs=400)
+    counts, failures = fuzz.fuzz(tmp_path, seed, inputs=475)
     assert not failures, failures
     assert {outcome for _, outcome in counts} == {"read", "refused"}
 
 
 def test_every_kind_accepts_its_undamaged_files(tmp_path: Path) -> None:
-    for kind in kinds(tmp_path):
+    for kind in fuzz.kinds(tmp_path):
         for seed in kind.seeds:
             if seed or kind.name in ("labels", "predictions"):
-                assert fuzz.read(kind, seed) == ("read", "")
+                assert fuzz.read(kind, seed) == ("read", ""), kind.name
 
 
 def test_bad_outcomes_are_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -39,3 +39,14 @@ def test_bad_outcomes_are_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     assert outcome(np.zeros((1, 4))) == "read"
     monkeypatch.setattr(fuzz, "SLOW_S", 0.05)  # of the last one alone: a busy machine may make the others as slow
     assert outcome("sleep") == "slow"
+
+
+def test_a_file_outside_of_the_target_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def stray(path: Path) -> int:
+        if path.read_bytes() != b"x":  # but not the first time
+            (path.parent.parent / "stray").write_bytes(path.read_bytes())
+        return 0
+
+    monkeypatch.setattr(fuzz, "kinds", lambda place: [Kind("made up", place / "own" / "a", (b"x",), stray)])
+    counts, failures = fuzz.fuzz(tmp_path, 1, inputs=5)
+    assert counts["made up", fuzz.LEFT] and "stray" in failures[0]

@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -13,39 +14,16 @@ from asca_pillars.cli import eval as command
 def evaluate(
     model: Path | None = None,
     *,
-    data: Path | None = None,
-    predictions: Path | None = None,
-    labels: Path | None = None,
     out: Path,
     json_path: Path | None = None,
     gallery: int | None = 0,
-    compare: Path | None = None,
-    score: list[str] | None = None,
-    min_score: float = 0.05,
-    provider: str = "cpu",
-    precision: str | None = None,
-    threads: int | None = 1,
     protocol: Protocol = "kitti",
-    split: str | None = None,
+    **options: Any,
 ) -> dict:
     """Run the command; what it wrote as JSON."""
-    command.evaluate(
-        model,
-        data=data,
-        split=split,
-        predictions=predictions,
-        labels=labels,
-        out=out,
-        json=json_path,
-        gallery=gallery,
-        compare=compare,
-        score=score,
-        min_score=min_score,
-        protocol=protocol,
-        provider=provider,
-        precision=precision,
-        threads=threads if predictions is None else None,
-    )
+    threads = {} if "predictions" in options else {"threads": 1}
+    options = {"out": out, "json": json_path, "gallery": gallery, "protocol": protocol} | threads | options
+    command.evaluate(model, **options)
     return json.loads((out / ("report.json" if protocol == "kitti" else "waymo.json")).read_text())
 
 

@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
@@ -11,7 +12,7 @@ from asca_deploy import sample_scan_path
 from asca_deploy.result_files import ResultWriter
 from asca_pillars.base.errors import OutputError, ScanError
 from asca_pillars.cli.detect import detect
-from asca_pillars.data.kitti import KittiSplit
+from asca_pillars.data.kitti import KittiSplit, read_labels
 from asca_pillars.scans.scan_reader import read_scan, write_scan
 from tests.helpers.scenes import write_dataset
 
@@ -38,7 +39,12 @@ def test_a_damaged_scan_is_named_and_the_others_are_detected(
     (tmp_path / "mix" / "\x1b[31m\n2.bin").write_bytes(b"torn")
     with pytest.raises(ScanError, match=r"1 of 3 scans could not be read"):
         detect([tmp_path / "mix"], out=tmp_path / "out", threads=1, pictures=False)
+    for name in ("1.bin", "2.bin"):
+        write_scan(tmp_path / "torn" / name, POINTS)
+        (tmp_path / "torn" / name).write_bytes(b"torn")
     captured = capsys.readouterr()
+    with pytest.raises(ScanError, match="none of the 2 scans can be read"):
+        detect([tmp_path / "torn"], out=tmp_path / "none", threads=1)
     assert r"\x1b[31m\n2.bin: 4 bytes" in captured.err and "3.bin" in captured.out
     assert {path.name for path in (tmp_path / "out").iterdir()} == {"1.json", "3.json", "detections.jsonl"}
 
@@ -66,14 +72,12 @@ def test_a_folder_of_other_files_is_refused_and_one_of_an_earlier_run_is_not(tmp
     for name in ("1.bin", "2.bin"):
         write_scan(tmp_path / "scans" / name, POINTS)
     (tmp_path / "mine").mkdir()
-    (tmp_path / "mine" / "1.json").write_text("mine")
-    with pytest.raises(OutputError, match=r"holds 1\.json and nothing that `asca detect` wrote"):
-        detect([tmp_path / "scans" / "1.bin"], out=tmp_path / "mine", threads=1)
-    assert (tmp_path / "mine" / "1.json").read_text() == "mine"
-    (tmp_path / "mine" / "1.json").unlink()
-    (tmp_path / "mine" / "detections.jsonl").write_text('{"mine": 1}')
-    with pytest.raises(OutputError, match=r"holds detections\.jsonl and nothing that `asca detect` wrote"):
-        detect([tmp_path / "scans" / "1.bin"], out=tmp_path / "mine", threads=1)
+    for name, content in (("1.json", "mine"), ("detections.jsonl", '{"mine": 1}')):
+        (tmp_path / "mine" / name).write_text(content)
+        with pytest.raises(OutputError, match=rf"holds {name} and nothing that `asca detect` wrote"):
+            detect([tmp_path / "scans" / "1.bin"], out=tmp_path / "mine", threads=1)
+        assert (tmp_path / "mine" / name).read_text() == content
+        (tmp_path / "mine" / name).unlink()
     for scans in (tmp_path / "scans", tmp_path / "scans" / "2.bin"):
         detect([scans], out=tmp_path / "out", threads=1, pictures=False)
     assert {path.name for path in (tmp_path / "out").iterdir()} == {"1.json", "2.json", "detections.jsonl"}
@@ -159,31 +163,23 @@ def test_scans_may_have_the_names_of_other_results(tmp_path: Path) -> None:
     assert json.loads((tmp_path / "out" / "recording.json").read_text())["scan"].endswith("recording.bin")
 
 
-def test_nothing_readable_is_an_error(tmp_path: Path) -> None:
-    for name in ("1.bin", "2.bin"):
-        (tmp_path / name).write_bytes(b"torn")
-    with pytest.raises(ScanError, match="none of the 2 scans can be read"):
-        detect([tmp_path], out=tmp_path / "out", threads=1)
-
-
-def test_an_image_that_cannot_be_read_is_said(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    root = write_dataset(tmp_path / "kitti", 1)
-    image = KittiSplit(root).image_path("000000")
-    image.parent.mkdir()
-    image.write_bytes(b"no picture")
-    detect([KittiSplit(root).scan_path("000000")], out=tmp_path / "out", threads=1)
-    assert "000000.png: cannot be read as an image" in " ".join(capfd.readouterr().out.split())
-
-
-def test_a_damaged_calibration_is_said_and_the_scans_are_detected(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    split = KittiSplit(write_dataset(tmp_path / "kitti", 3))
-    split.calib_path("000001").write_text("P2: 1 2\n")
-    detect([split.scan_path("000000").parent], out=tmp_path / "out", threads=1)
-    output = " ".join(capsys.readouterr().out.split())
-    assert "no KITTI text is written: " in output and "000001.txt: " in output
-    written = {path.name for path in (tmp_path / "out").iterdir()}
-    assert written >= {"000000.txt", "000001.json", "000001_bev.png", "000002.txt"} and "000001.txt" not in written
-    lines = (tmp_path / "out" / "detections.jsonl").read_text().splitlines()
-    assert [Path(json.loads(line)["scan"]).name for line in lines] == ["000000.bin", "000001.bin", "000002.bin"]
+def test_what_lies_beside_a_scan_is_used_or_said(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    """A calibration becomes KITTI text, and with an image a picture of the boxes in it."""
+    split, out = KittiSplit(write_dataset(tmp_path / "kitti", 4)), tmp_path / "out"
+    split.image_path("000000").parent.mkdir()
+    cv2.imwrite(str(split.image_path("000000")), np.full((375, 1242, 3), 90, np.uint8))
+    split.image_path("000001").write_bytes(b"no picture")
+    split.calib_path("000002").write_text("P2: 1 2\n")
+    split.calib_path("000003").unlink()
+    detect([split.scan_path("000000").parent], out=out, threads=1, score=["0.02"])
+    output, names = " ".join(capfd.readouterr().out.split()), {path.name for path in out.iterdir()}
+    assert "000001.png: cannot be read as an image" in output
+    assert names >= {"000000.txt", "000000_image.png", "000001.txt", "000002.json", "000002_bev.png", "000003.json"}
+    assert not names & {"000001_image.png", "000002.txt", "000003.txt"}
+    for item in read_labels(out / "000000.txt"):
+        assert item.score is not None and 0 <= item.bbox[0] < item.bbox[2] <= 1242
+    lines = (out / "detections.jsonl").read_text().splitlines()
+    assert [Path(json.loads(line)["scan"]).stem for line in lines] == list(split.frame_ids)
+    detect([split.scan_path("000002")], out=out, threads=1)  # of several remarks the first is said
+    output = " ".join(capfd.readouterr().out.split())
+    assert "no KITTI text is written: " in output and "000002.txt: " in output

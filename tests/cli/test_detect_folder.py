@@ -1,18 +1,26 @@
-"""`asca detect` of a folder of scans over time: the tracks and files are those of a recording of the same scans."""
+"""`asca detect` of a folder of scans over time: tracks and files as of a recording, videos, the page of pictures."""
 
 import json
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
+pytest.importorskip("rosbags", reason="needs pip install -e '.[recordings]'")
+
+from asca_deploy import result_files
 from asca_deploy.detect_scans import detect_scans
+from asca_deploy.recordings import video as recording_video
+from asca_deploy.recordings.video import recording_rate_hz
 from asca_pillars.base.errors import AscaError, ConfigError, OutputError, ScanError
 from asca_pillars.cli.detect import detect
-from asca_pillars.pictures.video import BoxVideo
+from asca_pillars.pictures.video import BoxVideo, is_own_video
 from asca_pillars.scans.scan_reader import write_scan
 from tests.cli.short_drive import POINTS, SCANS
+from tests.helpers.gallery_cards import cards, sources, title
+from tests.helpers.video_encoder import needs_encoder
 from tests.scans.recordings.cloud_recordings import stamps
 
 
@@ -28,27 +36,23 @@ def lines(out: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in (out / "detections.jsonl").read_text().splitlines()]
 
 
+def frames(path: Path) -> list[np.ndarray]:
+    read = cv2.VideoCapture(str(path))
+    return [read.read()[1] for _ in range(int(read.get(cv2.CAP_PROP_FRAME_COUNT)))]
+
+
 def write_times(path: Path) -> Path:
     path.write_text("".join(f"{time_ns / 1e9:.9f}\n" for time_ns in stamps(SCANS)))
     return path
 
 
 def test_tracks_and_files_are_those_of_a_recording(folder: Path, drive: Path, tmp_path: Path) -> None:
-    pytest.importorskip("rosbags", reason="needs pip install -e '.[recordings]'")
     from mcap.reader import make_reader
 
     messages: dict[Path, list[tuple[int, bytes]]] = {}
     for path, times in ((folder, write_times(tmp_path / "times.txt")), (drive, None)):
         foxglove = tmp_path / f"{path.stem}_boxes.mcap"
-        detect(
-            [path],
-            out=tmp_path / f"of_{path.stem}",
-            threads=1,
-            track=True,
-            times=times,
-            foxglove=foxglove,
-            pictures=False,
-        )
+        detect([path], out=tmp_path / f"of_{path.stem}", track=True, times=times, foxglove=foxglove, pictures=False)
         with foxglove.open("rb") as file:
             messages[path] = [(one.log_time, one.data) for *_, one in make_reader(file).iter_messages()]
     of_folder, of_drive = lines(tmp_path / "of_scans"), lines(tmp_path / "of_drive")
@@ -91,8 +95,9 @@ def test_a_scan_that_cannot_be_read_keeps_its_time(folder: Path, tmp_path: Path)
     )
 
 
-def test_the_video_shows_identities(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    pytest.importorskip("imageio_ffmpeg", reason="needs pip install -e '.[video]'")
+@needs_encoder
+@pytest.mark.parametrize("view", ["above", "chase"])
+def test_the_video_shows_identities(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, view: Any) -> None:
     shown = []
     draw = BoxVideo.draw
 
@@ -101,10 +106,14 @@ def test_the_video_shows_identities(folder: Path, tmp_path: Path, monkeypatch: p
         return draw(self, points, detections, time_s, ids, pose)
 
     monkeypatch.setattr(BoxVideo, "draw", drawn)
-    found = detect_scans(folder, track=True, rate_hz=20, video=tmp_path / "a.mp4")
+    for _ in range(2):  # the second replaces the first
+        shown.clear()
+        found = detect_scans(folder, track=True, rate_hz=20, video=tmp_path / "a.mp4", video_view=view)
     assert [time_s for time_s, _ in shown] == pytest.approx([0.05 * number for number in range(SCANS)])
     assert [ids for _, ids in shown] == [one.tracks.track_ids.tolist() for one in found if one.tracks is not None]
-    assert (tmp_path / "a.mp4").stat().st_size
+    images = frames(tmp_path / "a.mp4")
+    assert is_own_video(tmp_path / "a.mp4") and len(images) == SCANS
+    assert np.abs(images[0].astype(int) - images[-1]).mean() > 0.5
 
 
 def test_the_file_for_rerun_is_one(folder: Path, tmp_path: Path) -> None:
@@ -115,10 +124,15 @@ def test_the_file_for_rerun_is_one(folder: Path, tmp_path: Path) -> None:
     assert is_own_rrd(tmp_path / "a.rrd")
 
 
-def test_what_does_not_fit_is_refused_before_the_work(folder: Path, drive: Path, tmp_path: Path) -> None:
+def test_what_does_not_fit_is_refused_before_the_work(
+    folder: Path, drive: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     write_scan(tmp_path / "more" / "1.bin", POINTS)
     times = write_times(tmp_path / "times.txt")
     (tmp_path / "short.txt").write_text("0\n")
+    (tmp_path / "mine.mp4").write_bytes(b"\0\0\0\x20ftypisom of mine")
+    monkeypatch.setattr(recording_video, "find_encoder", lambda: "ffmpeg")
+    mp4 = tmp_path / "a.mp4"
     cases: list[tuple[list[Path], dict[str, Any], type[AscaError], str]] = [
         ([folder, tmp_path / "more"], {"track": True}, ConfigError, "scans lie in one folder"),
         ([folder], {"rate": 0.0}, ConfigError, "--rate 0: give scans per second"),
@@ -127,6 +141,11 @@ def test_what_does_not_fit_is_refused_before_the_work(folder: Path, drive: Path,
         ([folder], {"track": True, "cluster": "local"}, ConfigError, "do not go with --cluster"),
         ([folder], {"foxglove": tmp_path / "a.bag"}, ConfigError, "viewers open .mcap files"),
         ([folder], {"foxglove": drive}, OutputError, "did not write it"),
+        ([folder], {"video": tmp_path / "mine.mp4"}, OutputError, "mine.mp4: `asca detect` did not write it"),
+        ([folder], {"video": tmp_path / "a.avi"}, ConfigError, "viewers open .mp4 files"),
+        ([folder], {"video_view": "chase"}, ConfigError, "--video-view chase: is of a video; give --video"),
+        ([folder], {"video": mp4, "video_view": "side"}, ConfigError, "--video-view side: give above or chase"),
+        ([folder], {"video": mp4, "cluster": "local"}, ConfigError, "is not made with --cluster"),
         ([drive], {"rate": 5.0}, ConfigError, "--rate 5: is for folders of scans"),
         ([drive], {"times": times}, ConfigError, "--times .*: is for folders of scans"),
     ]
@@ -134,3 +153,48 @@ def test_what_does_not_fit_is_refused_before_the_work(folder: Path, drive: Path,
         with pytest.raises(kind, match=message):
             detect(paths, out=tmp_path / "out", threads=1, **options)
     assert not (tmp_path / "out").exists()
+
+
+@needs_encoder
+def test_a_recording_becomes_a_video_of_tracks(drive: Path, tmp_path: Path) -> None:
+    detect([drive], out=tmp_path / "out", threads=1, track=True, video=tmp_path / "a.mp4")
+    assert len(frames(tmp_path / "a.mp4")) == SCANS
+    assert not (tmp_path / "out" / "index.html").exists()
+
+
+def test_a_video_runs_as_fast_as_its_recording() -> None:
+    regular = np.arange(10) * 50_000_000
+    assert recording_rate_hz(regular.tolist()) == pytest.approx(20)
+    assert recording_rate_hz([*regular.tolist(), 10**18]) == pytest.approx(20)
+    assert recording_rate_hz([5, 5]) == recording_rate_hz([]) == 10
+
+
+def test_a_page_shows_the_pictures_of_a_run(folder: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    detect([folder], out=out, threads=1)
+    page = (out / "index.html").read_text()
+    assert title(out / "index.html") == f"asca detect: {SCANS} scans"
+    assert list(cards(page)) == ["0", "1", "2", "3", "4"]
+    assert all(one.keys() == {"boxes", "best score", "lowest score"} for one in cards(page).values())
+    assert all((out / source).is_file() for source in sources(page))
+    detect([folder], out=out, threads=1, pictures=False)
+    assert (out / "index.html").read_text() == page, "its pictures are of the same boxes"
+    detect([folder], out=out, threads=1, pictures=False, score=["0.9"])
+    assert not (out / "index.html").exists(), "its pictures are gone"
+    (out / "index.html").write_text("<h1>mine</h1>")
+    with pytest.raises(OutputError, match=r"index\.html: `asca detect` did not write it"):
+        detect([folder], out=out, threads=1)
+
+
+def test_misses_are_counted_where_there_are_labels(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One label on a car that is found, one where nothing is, one behind the sensor."""
+    write_scan(tmp_path / "scans" / "0.bin", POINTS)
+    detect([tmp_path / "scans"], out=tmp_path / "out", threads=1, pictures=False)
+    found = json.loads((tmp_path / "out" / "0.json").read_text())["boxes"][0]
+    keys = ("x_m", "y_m", "z_m", "length_m", "width_m", "height_m", "yaw_rad")
+    labels = np.array([[found[key] for key in keys]] * 3, np.float32)
+    labels[1:, :2] = (40, 25), (-20, 0)
+    monkeypatch.setattr(result_files, "labels_of_scan", lambda path: labels)
+    detect([tmp_path / "scans"], out=tmp_path / "out", threads=1)
+    (values,) = cards((tmp_path / "out" / "index.html").read_text()).values()
+    assert values["missed"] == 1

@@ -2,13 +2,11 @@
 
 import json
 import re
-import shutil
 import signal
 import subprocess
 import sys
-import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +19,6 @@ from scipy.spatial.transform import Rotation
 
 from asca_deploy import find_bundle, sample_scan_path
 from asca_deploy.manifest import load_bundle
-from asca_deploy.recordings import detect_recording as steps
 from asca_deploy.recordings.journal import JOURNAL_FILE, Journal, ScanResult
 from asca_pillars.base import extras
 from asca_pillars.base.errors import AscaError, ConfigError, OutputError, ScanError
@@ -33,14 +30,64 @@ from benchmarks.made_recordings import write_recording
 from tests.cli.short_drive import POINTS, SCANS, run
 from tests.helpers.in_process import run_here
 from tests.helpers.scenes import write_dataset
-from tests.scans.recordings.cloud_recordings import laid_out, stamps, transform_message, write_mcap
+from tests.scans.recordings.cloud_recordings import laid_out, odometry_message, stamps, transform_message, write_mcap
 
 
 @pytest.fixture(scope="module")
-def torn(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    times = stamps(3)
-    messages = [(times[0], laid_out(POINTS)), (times[1], b"torn"), (times[2], laid_out(POINTS))]
-    return write_mcap(tmp_path_factory.mktemp("torn") / "torn.mcap", {"/lidar": messages})
+def undisturbed(drive: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("undisturbed")
+    run_tracked(drive, out)
+    return out
+
+
+@pytest.fixture
+def calib(tmp_path: Path) -> Path:
+    return KittiSplit(write_dataset(tmp_path / "kitti", 1)).calib_path("000000")
+
+
+def run_tracked(drive: Path, out: Path) -> list[dict[str, Any]]:
+    return run(drive, out, track=True, foxglove=out / "boxes.mcap")
+
+
+def outputs(out: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in out.iterdir() if path.suffix in (".jsonl", ".mcap")}
+
+
+class Work:
+    """Numbers of the scans that are detected, not read from a journal; the run ends before one more than `most`."""
+
+    def __init__(self) -> None:
+        self.done: list[int] = []
+        self.most: int | None = None
+
+    def killed_after(self, most: int, *arguments: Path, **options: Any) -> Path:
+        """Run until as many scans are done; the journal that is left."""
+        self.most = most
+        with pytest.raises(KeyboardInterrupt):
+            run(*arguments, **options)
+        self.done, self.most = [], None
+        return arguments[1] / JOURNAL_FILE
+
+
+@pytest.fixture
+def work(monkeypatch: pytest.MonkeyPatch) -> Work:
+    work, add = Work(), Journal.add
+
+    def note(self: Journal, result: ScanResult) -> None:
+        if len(work.done) == work.most:
+            raise KeyboardInterrupt
+        add(self, result)
+        work.done.append(result.number)
+
+    monkeypatch.setattr(Journal, "add", note)
+    return work
+
+
+@pytest.fixture
+def journal(drive: Path, tmp_path: Path, work: Work) -> Path:
+    """A journal of all scans but the last, in tmp_path/killed."""
+    out = tmp_path / "killed"
+    return work.killed_after(SCANS - 1, drive, out, track=True, foxglove=out / "boxes.mcap")
 
 
 def test_a_line_for_each_scan_with_its_time(drive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -106,7 +153,7 @@ def test_boxes_are_in_the_vehicles_frame(drive: Path, tmp_path: Path) -> None:
 def test_foxglove_file_is_read_back(drive: Path, tmp_path: Path) -> None:
     from mcap.reader import make_reader
 
-    lines = run(drive, tmp_path / "out", track=True, foxglove=tmp_path / "boxes.mcap")
+    lines = run_tracked(drive, tmp_path)
     with (tmp_path / "boxes.mcap").open("rb") as file:
         reader = make_reader(file, validate_crcs=True)
         messages = list(reader.iter_messages())
@@ -139,8 +186,7 @@ def _conforms(value: Any, schema: dict[str, Any]) -> None:
         _conforms(item, schema["items"])
 
 
-def test_kitti_tracking_text(drive: Path, tmp_path: Path) -> None:
-    calib = KittiSplit(write_dataset(tmp_path / "kitti", 1)).calib_path("000000")
+def test_kitti_tracking_text(drive: Path, calib: Path, tmp_path: Path) -> None:
     lines = run(drive, tmp_path / "out", track=True, calib=calib)
     rows = [row.split() for row in (tmp_path / "out" / "tracks.txt").read_text().splitlines()]
     assert {len(row) for row in rows} == {18}, "frame, identity, 15 fields of a label, score"
@@ -148,142 +194,92 @@ def test_kitti_tracking_text(drive: Path, tmp_path: Path) -> None:
     assert len(rows) > SCANS and {(int(row[0]), int(row[1]), row[2]) for row in rows} <= known
 
 
-@pytest.fixture(scope="module")
-def undisturbed(drive: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    out = tmp_path_factory.mktemp("undisturbed")
-    run(drive, out, track=True, foxglove=out / "boxes.mcap")
-    return out
-
-
-def outputs(out: Path) -> dict[str, bytes]:
-    return {path.name: path.read_bytes() for path in out.iterdir() if path.suffix in (".jsonl", ".mcap")}
-
-
-@pytest.mark.parametrize(("after", "torn_line"), [(0, b""), (1, b'{"number": '), (4, b"\x00\xff")])
-def test_a_killed_run_goes_on_and_ends_the_same(
-    drive: Path, undisturbed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, after: int, torn_line: bytes
-) -> None:
-    killed = tmp_path / "killed"
-    add = Journal.add
-    done: list[None] = []
-
-    def dies(self: Journal, result: Any) -> None:
-        if len(done) == after:
-            raise KeyboardInterrupt
-        done.append(add(self, result))
-
-    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(Journal, "add", dies)
-        run(drive, killed, track=True, foxglove=killed / "boxes.mcap")
-    assert [path.name for path in killed.iterdir()] == [JOURNAL_FILE], "nothing that looks like a result"
-    with (killed / JOURNAL_FILE).open("ab") as file:
-        file.write(torn_line)
-    detected: list[int] = []
-    monkeypatch.setattr(Journal, "add", lambda self, result: detected.append(result.number) or add(self, result))
-    run(drive, killed, track=True, foxglove=killed / "boxes.mcap")
-    assert detected == list(range(after, SCANS)), "what was done is not done again"
-    assert outputs(killed) == outputs(undisturbed)
-
-
-def _dies(*_: object) -> Iterator[None]:
-    raise KeyboardInterrupt
-
-
-@pytest.fixture
-def journal(drive: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A journal of all scans, in tmp_path/killed."""
-    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(steps, "track_results", _dies)
-        run(drive, tmp_path / "killed", track=True, foxglove=tmp_path / "killed" / "boxes.mcap")
-    return tmp_path / "killed" / JOURNAL_FILE
+def _line_2(change: Callable[[bytes], bytes]) -> Callable[[list[bytes]], list[bytes]]:
+    """A change of the line of scan 2, behind the heading and those of scans 0 and 1."""
+    return lambda lines: [*lines[:3], change(lines[3]), *lines[4:]]
 
 
 @pytest.mark.parametrize(
-    "change",
+    ("change", "detected"),
     [
-        lambda line: line.replace(b'"boxes": [[', b'"boxes": [[1', 1),  # still JSON, of 7 numbers
-        lambda line: line.replace(b'"labels": [', b'"labels": [9, ', 1),
-        lambda line: line.replace(b'"number": 2', b'"number": 3', 1),
-        lambda line: b'["0123456789abcdef", {"number": 2}]\n',
-        lambda line: b'{"number": 2, "time_ns": 0, "frame_id": "", "trouble": "made up"}\n',
-        lambda line: b"\x00" * 20 + b"\n",
-        lambda line: line[:-1],  # two lines in one
-        lambda line: b"",
+        (lambda lines: lines[:1], [0, 1, 2, 3, 4]),
+        (lambda lines: [*lines[:2], b'{"number": '], [1, 2, 3, 4]),
+        (lambda lines: [*lines, b"\x00\xff"], [4]),
+        (_line_2(lambda line: line.replace(b'"boxes": [[', b'"boxes": [[1', 1)), [2, 4]),  # still JSON, of 7 numbers
+        (_line_2(lambda line: line.replace(b'"labels": [', b'"labels": [9, ', 1)), [2, 4]),
+        (_line_2(lambda line: line.replace(b'"number": 2', b'"number": 3', 1)), [2, 4]),
+        (_line_2(lambda line: b'["0123456789abcdef", {"number": 2}]\n'), [2, 4]),
+        (_line_2(lambda line: b'{"number": 2, "time_ns": 0, "frame_id": "", "trouble": "made up"}\n'), [2, 4]),
+        (_line_2(lambda line: b"\x00" * 20 + b"\n"), [2, 4]),
+        (_line_2(lambda line: line[:-1]), [2, 3, 4]),  # two lines in one
+        (_line_2(lambda line: b""), [2, 4]),
     ],
 )
-def test_damaged_lines_of_a_journal_are_done_again(
+def test_a_killed_run_goes_on_and_ends_the_same(
     drive: Path,
     undisturbed: Path,
     journal: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    change: Callable[[bytes], bytes],
+    work: Work,
+    change: Callable[[list[bytes]], list[bytes]],
+    detected: list[int],
 ) -> None:
-    lines = journal.read_bytes().splitlines(keepends=True)
-    lines[3] = change(lines[3])
-    journal.write_bytes(b"".join(lines))
-    detected: list[int] = []
-    add = Journal.add
-    monkeypatch.setattr(Journal, "add", lambda self, result: detected.append(result.number) or add(self, result))
-    run(drive, journal.parent, track=True, foxglove=journal.parent / "boxes.mcap")
-    assert detected in ([2], [2, 3]), "and no others"
+    assert list(journal.parent.iterdir()) == [journal], "nothing that looks like a result"
+    journal.write_bytes(b"".join(change(journal.read_bytes().splitlines(keepends=True))))
+    run_tracked(drive, journal.parent)
+    assert work.done == detected, "what was done is not done again"
     assert outputs(journal.parent) == outputs(undisturbed)
 
 
-def test_a_journal_of_other_scans_is_not_mixed_in(drive: Path, undisturbed: Path, journal: Path) -> None:
+def test_a_journal_of_other_scans_is_not_mixed_in(
+    drive: Path, undisturbed: Path, journal: Path, tmp_path: Path
+) -> None:
     """Whole lines, of a run with another score."""
-    other = Journal(journal.parent / "other", {"score": 0.9}, ("Car",))
-    with other:
-        for number in range(SCANS):
+    with Journal(tmp_path / "other", {"score": 0.9}, ("Car",)) as other:
+        for number in range(SCANS - 1):
             other.add(ScanResult(number, number, "other", None, "made up"))
-    theirs = other.path.read_bytes().splitlines(keepends=True)
-    ours = journal.read_bytes().splitlines(keepends=True)
+    ours, theirs = (path.read_bytes().splitlines(keepends=True) for path in (journal, other.path))
     journal.write_bytes(b"".join([*ours[:3], *theirs[3:]]))
-    shutil.rmtree(journal.parent / "other")
-    run(drive, journal.parent, track=True, foxglove=journal.parent / "boxes.mcap")
+    run_tracked(drive, journal.parent)
     assert outputs(journal.parent) == outputs(undisturbed)
 
 
 @pytest.mark.parametrize(
-    "content",
-    [b"", b"my notes\n", b'{"recording": "mine"}\n{"number": 0}\n', b'["0123456789abcdef", {}]\n', b"\x00" * 99],
+    ("content", "beside"),
+    [
+        (b"", "thesis.txt"),
+        (b"my notes\n", "detections.jsonl"),  # beside an earlier run, too
+        (b'{"recording": "mine"}\n{"number": 0}\n', "thesis.txt"),
+        (b'["0123456789abcdef", {}]\n', "detections.jsonl"),
+        (b"\x00" * 99, "thesis.txt"),
+    ],
 )
-@pytest.mark.parametrize("beside", ["thesis.txt", "detections.jsonl"])
 def test_what_is_no_journal_is_neither_cut_nor_removed(
     drive: Path, tmp_path: Path, undisturbed: Path, content: bytes, beside: str
 ) -> None:
-    """Beside an earlier run, too; and it makes nobody's folder ours."""
-    out = tmp_path / "out"
-    out.mkdir()
-    (out / JOURNAL_FILE).write_bytes(content)
-    (out / beside).write_bytes((undisturbed / "detections.jsonl").read_bytes())
+    """And it makes nobody's folder ours."""
+    (tmp_path / JOURNAL_FILE).write_bytes(content)
+    (tmp_path / beside).write_bytes((undisturbed / "detections.jsonl").read_bytes())
     with pytest.raises(OutputError):
-        run(drive, out)
-    assert (out / JOURNAL_FILE).read_bytes() == content and len(list(out.iterdir())) == 2
+        run(drive, tmp_path)
+    assert (tmp_path / JOURNAL_FILE).read_bytes() == content and len(list(tmp_path.iterdir())) == 2
 
 
-def test_a_journal_is_not_written_through_a_link(drive: Path, journal: Path) -> None:
-    elsewhere = journal.rename(journal.parent.parent / "elsewhere")
-    journal.symlink_to(elsewhere)
-    before = elsewhere.read_bytes()
-    with pytest.raises(OutputError, match=f"{JOURNAL_FILE}: is a link"):
-        run(drive, journal.parent)
-    assert elsewhere.read_bytes() == before and journal.is_symlink()
-
-
-@pytest.mark.parametrize("name", ["recording.json", "detections.jsonl", "tracks.txt"])
-def test_results_are_not_written_through_links(drive: Path, tmp_path: Path, name: str) -> None:
-    calib = KittiSplit(write_dataset(tmp_path / "kitti", 1)).calib_path("000000")
-    run(drive, tmp_path / "out", calib=calib)
-    elsewhere = (tmp_path / "out" / name).rename(tmp_path / "elsewhere")
-    (tmp_path / "out" / name).symlink_to(elsewhere)
+@pytest.mark.parametrize("name", [JOURNAL_FILE, "recording.json", "detections.jsonl", "tracks.txt"])
+def test_nothing_is_written_through_a_link(drive: Path, calib: Path, tmp_path: Path, work: Work, name: str) -> None:
+    out = tmp_path / "out"
+    if name == JOURNAL_FILE:
+        work.killed_after(1, drive, out, calib=calib)
+    else:
+        run(drive, out, calib=calib)
+    elsewhere = (out / name).rename(tmp_path / "elsewhere")
+    (out / name).symlink_to(elsewhere)
     before = elsewhere.read_bytes()
     with pytest.raises(OutputError, match=f"{name}: is a link"):
-        run(drive, tmp_path / "out", calib=calib)
-    assert elsewhere.read_bytes() == before
+        run(drive, out, calib=calib)
+    assert elsewhere.read_bytes() == before and (out / name).is_symlink()
 
 
-def test_what_tells_of_a_recording_does_not_stay_beside_other_scans(drive: Path, tmp_path: Path) -> None:
-    calib = KittiSplit(write_dataset(tmp_path / "kitti", 1)).calib_path("000000")
+def test_what_tells_of_a_recording_does_not_stay_beside_other_scans(drive: Path, calib: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     for scans in (drive, sample_scan_path()):
         run(drive, out, calib=calib)
@@ -295,45 +291,43 @@ def test_what_tells_of_a_recording_does_not_stay_beside_other_scans(drive: Path,
         assert (out / "notes.txt").is_file()
 
 
-HELD_UP = """
-import time
+KILLS_ITSELF = """
+import os, signal
 from asca_pillars.cli.main import main
 from asca_deploy.recordings.journal import Journal
 add = Journal.add
-def add_and_wait(self, result):
+def add_and_die(self, result):
     add(self, result)
-    time.sleep(600 if result.number == 2 else 0)
-Journal.add = add_and_wait
+    if result.number == 2:
+        os.kill(os.getpid(), signal.SIGKILL)
+Journal.add = add_and_die
 main()
 """
 
 
 def test_after_sigkill(drive: Path, undisturbed: Path, tmp_path: Path) -> None:
-    out = tmp_path / "killed"
-    command = ["detect", drive, "--track", "-o", out, "--foxglove", out / "boxes.mcap", "--threads", 1]
-    # Held up after the third scan, so that it cannot end before it is killed.
-    process = subprocess.Popen([sys.executable, "-c", HELD_UP, *map(str, command)], stdout=subprocess.DEVNULL)
-    while process.poll() is None:
-        if (out / JOURNAL_FILE).exists() and (out / JOURNAL_FILE).read_bytes().count(b"\n") == 1 + 3:
-            process.kill()
-            break
-        time.sleep(0.01)
-    assert process.wait() == -signal.SIGKILL
-    assert not (out / "detections.jsonl").exists()
+    command = ["detect", drive, "--track", "-o", tmp_path, "--foxglove", tmp_path / "boxes.mcap", "--threads", 1]
+    killed = subprocess.run([sys.executable, "-c", KILLS_ITSELF, *map(str, command)], stdout=subprocess.DEVNULL)
+    assert killed.returncode == -signal.SIGKILL and not (tmp_path / "detections.jsonl").exists()
     resumed = run_here(*command)
     assert resumed.returncode == 0 and "going on after the" in resumed.stdout
-    assert outputs(out) == outputs(undisturbed)
+    assert outputs(tmp_path) == outputs(undisturbed)
 
 
+@pytest.mark.parametrize("setting", ["score", "pose"])
 def test_a_journal_of_other_settings_is_not_gone_on_with(
-    drive: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    drive: Path, tmp_path: Path, work: Work, setting: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(steps, "track_results", _dies)
-        run(drive, tmp_path, score=["0.9"])
-    assert (tmp_path / JOURNAL_FILE).exists() and "beginning anew" not in capsys.readouterr().out
-    assert min(box["score"] for line in run(drive, tmp_path, score=["0.5"]) for box in line["boxes"]) < 0.9
-    assert "beginning anew: another run was killed here, with another score" in capsys.readouterr().out
+    pose = tmp_path / "pose.txt"
+    for number, height in enumerate((0, 0.5)):
+        pose.write_text(f"1 0 0 0\n0 1 0 0\n0 0 1 {height if setting == 'pose' else 0}\n0 0 0 1\n")
+        options: dict[str, Any] = {"pose": pose, "score": ["0.9" if setting == "score" and number == 0 else "0.5"]}
+        if number == 0:
+            work.killed_after(SCANS - 1, drive, tmp_path / "out", **options)
+    assert "beginning anew" not in capsys.readouterr().out
+    lines = run(drive, tmp_path / "out", **options)
+    assert len(work.done) == SCANS and min(box["score"] for line in lines for box in line["boxes"]) < 0.9
+    assert "beginning anew: another run was killed here, with another " in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("track", [False, True])
@@ -344,29 +338,11 @@ def test_scores_of_classes(drive: Path, tmp_path: Path, track: bool) -> None:
     assert "Car" in every and few == every & {"Pedestrian"}
 
 
-def test_a_journal_of_another_pose_is_not_gone_on_with(
-    drive: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    pose = tmp_path / "pose.txt"
-    pose.write_text("1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n")
-    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(steps, "track_results", _dies)
-        run(drive, tmp_path / "out", pose=pose)
-    pose.write_text("1 0 0 0\n0 1 0 0\n0 0 1 0.5\n0 0 0 1\n")
-    detected: list[int] = []
-    add = Journal.add
-    monkeypatch.setattr(Journal, "add", lambda self, result: detected.append(result.number) or add(self, result))
-    run(drive, tmp_path / "out", pose=pose)
-    assert len(detected) == SCANS
-
-
-def test_results_in_the_folder_of_a_bag_are_no_part_of_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    write_recording(tmp_path / "bag", iter([(time_ns, POINTS) for time_ns in stamps(2)]))
-    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(steps, "track_results", _dies)
-        run(tmp_path / "bag", tmp_path / "bag" / "results")
-    monkeypatch.setattr(Journal, "add", lambda *_: pytest.fail("begun anew"))
-    assert len(run(tmp_path / "bag", tmp_path / "bag" / "results")) == 2
+def test_results_in_the_folder_of_a_bag_are_no_part_of_it(tmp_path: Path, work: Work) -> None:
+    bag = tmp_path / "bag"
+    write_recording(bag, iter([(time_ns, POINTS) for time_ns in stamps(2)]))
+    work.killed_after(1, bag, bag / "results")
+    assert len(run(bag, bag / "results")) == 2 and work.done == [1], "not begun anew"
 
 
 def test_two_runs_at_once_do_not_share_a_folder(drive: Path, tmp_path: Path) -> None:
@@ -374,12 +350,18 @@ def test_two_runs_at_once_do_not_share_a_folder(drive: Path, tmp_path: Path) -> 
         run(drive, tmp_path)
 
 
-def test_damaged_messages_are_skipped_and_counted(torn: Path, tmp_path: Path) -> None:
+def test_damaged_messages_are_skipped_and_counted(tmp_path: Path) -> None:
+    messages = zip(stamps(3), (laid_out(POINTS), b"torn", laid_out(POINTS)), strict=True)
+    torn = write_mcap(tmp_path / "torn.mcap", {"/lidar": list(messages)})
     with pytest.raises(ScanError, match=r"^1 scans were skipped: .*torn.mcap, /lidar, message 1: no readable"):
-        run(torn, tmp_path)
-    lines = [json.loads(line) for line in (tmp_path / "detections.jsonl").read_text().splitlines()]
+        run(torn, tmp_path / "out")
+    lines = [json.loads(line) for line in (tmp_path / "out" / "detections.jsonl").read_text().splitlines()]
     assert [line["scan"] for line in lines] == ["torn.mcap/000000", "torn.mcap/000002"]
-    assert not (tmp_path / JOURNAL_FILE).exists()
+    assert not (tmp_path / "out" / JOURNAL_FILE).exists()
+    nothing = write_mcap(tmp_path / "a.mcap", {"/lidar": [(stamps(1)[0], b"torn")]})
+    with pytest.raises(ScanError, match=r"none of the 1 scans of /lidar can be read: .*message 0"):
+        run(nothing, tmp_path / "none")
+    assert not (tmp_path / "none" / "detections.jsonl").exists()
 
 
 def test_a_recording_without_its_end_gives_what_it_has(drive: Path, tmp_path: Path) -> None:
@@ -390,39 +372,40 @@ def test_a_recording_without_its_end_gives_what_it_has(drive: Path, tmp_path: Pa
     assert 1 <= len((tmp_path / "out" / "detections.jsonl").read_text().splitlines()) < SCANS
 
 
-def test_nothing_readable_is_an_error_and_writes_nothing(tmp_path: Path) -> None:
-    path = write_mcap(tmp_path / "a.mcap", {"/lidar": [(stamps(1)[0], b"torn")]})
-    with pytest.raises(ScanError, match=r"none of the 1 scans of /lidar can be read: .*message 0"):
-        run(path, tmp_path / "out")
-    assert not (tmp_path / "out" / "detections.jsonl").exists()
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"pictures": True}, "--pictures: scans of a recording are not drawn"),
+        ({"columns": 7}, "--columns 7: is for"),
+        ({"foxglove": Path("boxes.json")}, "choose such a name"),
+        (
+            {"track": True, "score": ["1.2"]},
+            r"score_threshold 1\.2 of class Car must lie",
+        ),  # before anything is detected
+    ],
+)
+def test_options_that_do_not_fit(drive: Path, tmp_path: Path, options: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        run(drive, tmp_path, **options)
+    assert not list(tmp_path.iterdir()), "before anything is detected"
 
 
-def test_options_that_do_not_fit(drive: Path, tmp_path: Path) -> None:
+def test_a_recording_is_given_alone(drive: Path, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="need a recording"):
         detect([sample_scan_path()], out=tmp_path, topic="/lidar")
     with pytest.raises(ConfigError, match="give one alone"):
         detect([drive, sample_scan_path()], out=tmp_path)
-    with pytest.raises(ConfigError, match="--pictures: scans of a recording are not drawn"):
-        run(drive, tmp_path, pictures=True)
-    with pytest.raises(ConfigError, match="--columns 7: is for"):
-        run(drive, tmp_path, columns=7)
+
+
+def test_files_of_others_are_not_replaced(drive: Path, tmp_path: Path) -> None:
+    other = tmp_path / "other.mcap"
     before = drive.read_bytes()
-    with pytest.raises(OutputError, match=r"drive\.mcap: would replace .*drive\.mcap, which is read"):
-        run(drive, tmp_path, foxglove=drive)
-    assert drive.read_bytes() == before
-    other = tmp_path / "other" / "other.mcap"
-    other.parent.mkdir()
     other.write_bytes(before)
-    with pytest.raises(OutputError, match=r"other\.mcap: `asca detect` did not write it"):
-        run(drive, tmp_path / "none", foxglove=other)
-    assert other.read_bytes() == before
-    with pytest.raises(ConfigError, match=r"choose such a name"):
-        run(drive, tmp_path, foxglove=tmp_path / "boxes.json")
-    with pytest.raises(ConfigError, match=r"score_threshold 1\.2 of class Car must lie"):  # before anything is detected
-        run(drive, tmp_path / "none", track=True, score=["1.2"])
-    assert not (tmp_path / "none" / JOURNAL_FILE).exists()
-    (tmp_path / "mine.txt").write_text("precious")
-    with pytest.raises(OutputError, match=r"mine\.txt"):
+    for path, message in ((drive, "would replace .*drive.mcap, which is read"), (other, "did not write it")):
+        with pytest.raises(OutputError, match=f"{path.name}: .*{message}"):
+            run(drive, tmp_path / "none", foxglove=path)
+        assert path.read_bytes() == before
+    with pytest.raises(OutputError, match=r"other\.mcap"):
         run(drive, tmp_path)
 
 
@@ -430,3 +413,40 @@ def test_missing_libraries_are_named(drive: Path, tmp_path: Path, monkeypatch: p
     monkeypatch.setitem(extras.EXTRAS, "recordings", ("no_such_library",))
     with pytest.raises(AscaError, match=re.escape(install_command("recordings"))):
         run(drive, tmp_path)
+
+
+def test_with_odometry_what_stands_still_has_no_speed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The scans are those of a car that drives 5 m/s past things that stand still."""
+    messages = [
+        (time_ns, laid_out(POINTS - np.array([0.5 * i, 0, 0, 0], np.float32), time_ns=time_ns))
+        for i, time_ns in enumerate(stamps(SCANS))
+    ]
+    poses = [
+        (time_ns - 10**7, odometry_message(time_ns - 10**7, 100 + 0.5 * i - 0.05))
+        for i, time_ns in enumerate(stamps(SCANS + 1))
+    ]
+    path = write_mcap(tmp_path / "drive.mcap", {"/lidar": messages}, odometry=poses)
+    lines = run(path, tmp_path / "out", track=True, odometry="/odom")
+    speeds = [np.hypot(box["vx_mps"], box["vy_mps"]) for box in lines[-1]["boxes"] if box["class"] == "Car"]
+    assert len(speeds) >= 3 and np.median(speeds) < 1
+    mirror = np.array([1, -1, 1, 1], np.float32)
+    mirrored = [
+        (time_ns, laid_out((POINTS - np.array([0.5 * i, 0, 0, 0], np.float32)) * mirror, time_ns=time_ns))
+        for i, time_ns in enumerate(stamps(SCANS))
+    ]
+    path_mirrored = write_mcap(tmp_path / "mirrored.mcap", {"/lidar": mirrored}, odometry=poses)
+    seen = run(path_mirrored, tmp_path / "mirrored", track=True, odometry="/odom", axes="x,-y,z")
+    for key, sign in (("x_m", 1), ("y_m", -1), ("vx_mps", 1), ("vy_mps", -1), ("track_id", 1)):
+        expected = [sign * box[key] for box in lines[-1]["boxes"]]
+        assert [box[key] for box in seen[-1]["boxes"]] == pytest.approx(expected, abs=1e-3)
+    late = [(time_ns + 37 * 10**9, odometry_message(time_ns + 37 * 10**9, 0.0)) for time_ns in stamps(SCANS)]
+    other = write_mcap(tmp_path / "other.mcap", {"/lidar": messages}, odometry=late)
+    with pytest.raises(ScanError, match=r"from \+37.0 to \+37.4 s of the first scan; 5 of 5 scans are at other times"):
+        run(other, tmp_path / "other", track=True, odometry="/odom")
+    short = write_mcap(tmp_path / "short.mcap", {"/lidar": messages}, odometry=poses[:2])
+    run(short, tmp_path / "short", track=True, odometry="/odom")
+    assert "2 of 5 scans lie outside" in " ".join(capsys.readouterr().out.split())
+    with pytest.raises(ConfigError, match="give --track"):
+        run(path, tmp_path / "out", odometry="/odom")
+    with pytest.raises(ScanError, match="/lidar holds no nav_msgs/msg/Odometry; there is /odom"):
+        run(path, tmp_path / "out", track=True, odometry="/lidar")

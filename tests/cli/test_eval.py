@@ -16,6 +16,7 @@ from numpy.testing import assert_allclose
 
 from asca_deploy import default_bundle_path
 from asca_deploy.manifest import load_pillar_bundle
+from asca_pillars.base.errors import AscaError
 from asca_pillars.base.installation import install_command
 from asca_pillars.evaluation.kitti.average_precision import CLASS_NAMES
 from asca_pillars.models.build import build_model
@@ -23,34 +24,32 @@ from asca_pillars.models.checkpoint import Checkpoint
 from asca_pillars.scans.scan_reader import read_scan, write_scan
 from tests.cli.eval_runs import evaluate, refusal
 from tests.helpers.gallery_cards import cards, title
+from tests.helpers.hidden_modules import hiding
+from tests.helpers.in_process import invoke
 from tests.helpers.saved_checkpoint import save_checkpoint
 from tests.helpers.scenes import SPEC
 from tests.helpers.tiny_run import CONFIG
 
-BASE_INSTALL = """
-import sys
-from importlib.machinery import PathFinder
+BASE_INSTALL = hiding(
+    "torch lightning numba sklearn scipy matplotlib pandas",
+    """
 from pathlib import Path
-
-class BaseInstall(PathFinder):
-    @classmethod
-    def find_spec(cls, name, *rest):
-        if name.split(".")[0] in ("torch", "lightning", "numba", "sklearn", "scipy", "matplotlib", "pandas"):
-            return None
-        return super().find_spec(name, *rest)
-
-sys.meta_path = [BaseInstall if finder is PathFinder else finder for finder in sys.meta_path]
 from asca_pillars.cli.eval import evaluate
+
+
+
 evaluate(predictions=Path("det"), labels=Path("gt"), out=Path("out"))
-"""
+""",
+)
 
 
 def test_two_folders_of_text(tmp_path: Path, texts: dict[str, Any], capsys: pytest.CaptureFixture[str]) -> None:
     report = evaluate(**texts, out=tmp_path / "out", json_path=tmp_path / "deep" / "results.json", gallery=None)
     assert json.loads((tmp_path / "deep" / "results.json").read_text()) == report
     assert {path.name for path in (tmp_path / "out").iterdir()} == {"report.json", "report.md", "curves.png"}
-    # Six cars, all found: the protocol's cap.
-    assert report["results"]["Car"]["3d"]["R40"] == pytest.approx([12.5] * 3)
+    for name, objects in (("Car", 6), ("Pedestrian", 3), ("Cyclist", 3)):  # all found: the protocol's cap
+        for metric in ("bbox", "bev", "3d", "aos"):
+            assert_allclose(report["results"][name][metric]["R40"], 100 * (objects - 1) / 40)
     assert report["frames"] == 3 and report["shortage"] is None and report["environment"]["packages"]["numpy"]
     printed = capsys.readouterr().out
     assert f"{texts['predictions']} against {texts['labels']}: 3 frames" in printed
@@ -143,21 +142,16 @@ def test_a_checkpoint_is_a_model_too(tmp_path: Path, root: Path) -> None:
     save_checkpoint(tmp_path / "last.ckpt", Checkpoint(CONFIG, build_model(CONFIG.model), 7))
     report = evaluate(tmp_path / "last.ckpt", data=root, out=tmp_path / "out", min_score=0.001, threads=None)
     assert report["model"]["steps"] == 7 and report["model"]["provider"] == "torch cpu"
-    assert sorted(path.name for path in (tmp_path / "out" / "predictions").glob("*.txt")) == [
-        "000001.txt",
-        "000002.txt",
-    ]
-    assert "choose cpu, cuda or auto" in refusal(
-        tmp_path / "other", model=tmp_path / "last.ckpt", data=root, provider="x"
-    )
-    assert "precision reduced does not go with checkpoints" in refusal(
-        tmp_path / "other", model=tmp_path / "last.ckpt", data=root, precision="reduced"
-    )
-    assert "no such checkpoint" in refusal(tmp_path / "other", model=tmp_path / "none.ckpt", data=root)
-    assert (
-        refusal(tmp_path / "other", model=tmp_path / "last.ckpt", data=root, threads=0)
-        == f"threads 0 must lie between 1 and {4 * (os.cpu_count() or 1)}: this machine has {os.cpu_count()} CPUs"
-    )
+    names = sorted(path.name for path in (tmp_path / "out" / "predictions").glob("*.txt"))
+    assert names == ["000001.txt", "000002.txt"]
+    cpus = os.cpu_count() or 1
+    for wrong, message in (
+        ({"provider": "x"}, "choose cpu, cuda or auto"),
+        ({"precision": "reduced"}, "precision reduced does not go with checkpoints"),
+        ({"model": tmp_path / "none.ckpt"}, "no such checkpoint"),
+        ({"threads": 0}, f"threads 0 must lie between 1 and {4 * cpus}: this machine has {cpus} CPUs"),
+    ):
+        assert message in refusal(tmp_path / "other", **({"model": tmp_path / "last.ckpt", "data": root} | wrong))
 
 
 def test_a_model_of_other_classes_alone_is_refused_before_it_runs(tmp_path: Path, root: Path) -> None:
@@ -170,42 +164,45 @@ def test_a_model_of_other_classes_alone_is_refused_before_it_runs(tmp_path: Path
     assert not (tmp_path / "out").exists()
 
 
-def test_arguments_that_do_not_go_together(tmp_path: Path, root: Path, texts: dict[str, Any]) -> None:
-    det, gt = texts["predictions"], texts["labels"]
-    assert refusal(tmp_path) == "nothing to evaluate on: give --data ROOT, or --predictions DIR and --labels DIR"
-    assert refusal(tmp_path, predictions=det) == (
-        "--predictions det needs --labels DIR, or --data ROOT that has the labels"
-    )
-    assert refusal(tmp_path, labels=gt, data=root) == (
-        "--labels kitti/training/label_2 goes with --predictions DIR; a model is run on --data ROOT"
-    )
-    assert refusal(tmp_path, model=tmp_path / "b", predictions=det, labels=gt) == (
-        "b and --predictions det: give a model or its predictions, not both"
-    )
-    assert refusal(tmp_path, **texts, gallery=3) == "--gallery 3 draws scans: give --data ROOT that has them"
-    other = tmp_path / "out" / "predictions"
-    assert refusal(tmp_path, **texts, compare=det) == "--compare det draws scans: give --data ROOT that has them"
-    assert refusal(tmp_path, **texts, data=root, compare=det, gallery=0) == (
-        "--compare det draws scans: leave --gallery 0 out"
-    )
-    assert refusal(tmp_path, data=root, compare=other, gallery=None) == (
-        "--compare out/predictions: this evaluation writes there; give it another --out"
-    )
-    assert refusal(tmp_path, **texts, data=root, compare=det, protocol="waymo") == (
-        "--compare det belongs to the gallery of --protocol kitti; leave it out"
-    )
-    assert refusal(tmp_path, **texts, score=["nan"]) == "--score nan must be a number"
-    assert refusal(tmp_path, **texts, split="val") == (
-        "--split val is a list of the frames of a dataset: give --data ROOT, too"
-    )
-    assert refusal(tmp_path, data=root, score=["0.04"]) == (
-        "score 0.04 of Car is below --min-score 0.05, the lowest that default is run with; lower --min-score"
-    )
-    assert "bundle.json" in refusal(tmp_path, model=tmp_path, data=root)
-    assert "velodyne" in refusal(tmp_path, data=tmp_path)
-    (gt / "000002.txt").unlink()
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ("", "nothing to evaluate on: give --data ROOT, or --predictions DIR and --labels DIR"),
+        ("--predictions {det}", "--predictions det needs --labels DIR, or --data ROOT that has the labels"),
+        ("--labels {gt} --data {root}", "goes with --predictions DIR; a model is run on --data ROOT"),
+        ("b {texts}", "b and --predictions det: give a model or its predictions, not both"),
+        ("{texts} --gallery 3", "--gallery 3 draws scans: give --data ROOT that has them"),
+        ("{texts} --compare {det}", "--compare det draws scans: give --data ROOT that has them"),
+        ("{texts} --data {root} --compare {det} --gallery 0", "--compare det draws scans: leave --gallery 0 out"),
+        (
+            "--data {root} --compare {out}/predictions",
+            "--compare out/predictions: this evaluation writes there; give it",
+        ),
+        (
+            "{texts} --data {root} --compare {det} --protocol waymo",
+            "--compare det belongs to the gallery of --protocol",
+        ),
+        ("{texts} --score nan", "--score nan must be a number"),
+        ("{texts} --split val", "--split val is a list of the frames of a dataset: give --data ROOT, too"),
+        ("--data {root} --score 0.04", "score 0.04 of Car is below --min-score 0.05, the lowest that default is run"),
+        ("{root} --data {root}", "bundle.json"),
+        ("--data {det}", "velodyne"),
+    ],
+)
+def test_arguments_that_do_not_go_together(
+    tmp_path: Path, root: Path, texts: dict[str, Any], options: str, message: str
+) -> None:
+    det, gt, out = texts["predictions"], texts["labels"], tmp_path / "out"
+    given = options.format(det=det, gt=gt, texts=f"--predictions {det} --labels {gt}", root=root, out=out)
+    with pytest.raises(AscaError) as caught:
+        invoke("eval", *given.split(), "--out", out)
+    assert message in str(caught.value).replace(f"{tmp_path}/", "") and "\n" not in str(caught.value)
+    assert not out.exists()
+
+
+def test_a_frame_without_labels_is_named(tmp_path: Path, root: Path, texts: dict[str, Any]) -> None:
+    (texts["labels"] / "000002.txt").unlink()
     assert "label_2/000002.txt: cannot read the labels" in refusal(tmp_path, data=root)
-    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize("protocol", ["kitti", "waymo"])
@@ -255,8 +252,39 @@ def rename(folder: Path, name: str, other: str) -> None:
         path.write_text(path.read_text().replace(f"{name} ", f"{other} "))
 
 
-def test_labels_against_themselves_reach_the_cap(tmp_path: Path, texts: dict[str, Any]) -> None:
-    report = evaluate(**texts, out=tmp_path / "out")
-    for name, objects in (("Car", 6), ("Pedestrian", 3), ("Cyclist", 3)):
-        for metric in ("bbox", "bev", "3d", "aos"):
-            assert_allclose(report["results"][name][metric]["R40"], 100 * (objects - 1) / 40)
+def test_waymos_metric_of_labels_against_themselves(
+    tmp_path: Path, root: Path, texts: dict[str, Any], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """With scans at both levels, without them at LEVEL_2; every class and range that has objects gets 100."""
+    (texts["predictions"] / "000000.txt").unlink()
+    arguments: dict[str, Any] = {"predictions": texts["predictions"], "out": tmp_path / "out", "protocol": "waymo"}
+    report = evaluate(**arguments, data=root, json_path=tmp_path / "waymo.json")
+    assert json.loads((tmp_path / "waymo.json").read_text()) == report
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {"waymo.json", "waymo.md"}
+    assert report["frames"] == 2 and {item["class_name"] for item in report["results"]} == set(CLASS_NAMES)
+    for item in report["results"]:
+        expected = [pytest.approx(100)] * 2 if item["objects"] else [None] * 2
+        assert [item["AP"], item["APH"]] == expected
+    means = [item["mAP"] for item in report["means"] if item["low_m"] == 0 and item["high_m"] is None]
+    assert means == pytest.approx([100, 100])
+    assert "LEVEL_1 is not evaluated" not in capsys.readouterr().out
+    blind = evaluate(**arguments, labels=texts["labels"])
+    assert blind["results"][0]["AP"] is None and blind["results"][4]["AP"] == pytest.approx(100)
+    assert blind["frames_without_predictions"] == ["000000"]
+    assert "LEVEL_1 is not evaluated" in capsys.readouterr().out
+
+
+def test_waymos_metric_of_the_shipped_bundle(tmp_path: Path, root: Path) -> None:
+    report = evaluate(data=root, out=tmp_path / "out", protocol="waymo")
+    assert "default on" in report["subject"] and report["model"]["min_score"] == 0.05
+    assert len(list((tmp_path / "out" / "predictions").glob("*.txt"))) == 2
+    again = evaluate(predictions=tmp_path / "out" / "predictions", data=root, out=tmp_path / "again", protocol="waymo")
+    assert again["results"] == report["results"]
+
+
+def test_waymos_metric_takes_no_options_of_kittis(tmp_path: Path, root: Path, texts: dict[str, Any]) -> None:
+    waymo = {**texts, "protocol": "waymo"}
+    assert refusal(tmp_path, **waymo, score=["0.5"]) == (
+        "--score 0.5 belongs to --protocol kitti; Waymo's metric goes over all scores: leave it out"
+    )
+    assert "--gallery 2 belongs to --protocol kitti" in refusal(tmp_path, **waymo, data=root, gallery=2)

@@ -30,12 +30,8 @@ def root(tmp_path: Path) -> Path:
 def perfect(root: Path) -> Path:
     """The labels of all frames as predictions, written as elsewhere."""
     path = root.parent / "found.jsonl"
-    frames = read_frames(root / "labels.jsonl")
-    path.write_text(
-        "".join(
-            json_line(f"/data/{f.scan}", f.records._replace(scores=f.records.scores * 0 + 0.9)) for f in frames
-        ).replace(', "yaw', ', "score": 0.9, "yaw')
-    )
+    lines = (root / "labels.jsonl").read_text().replace('"scan": "', '"scan": "/data/')
+    path.write_text(lines.replace(', "yaw', ', "score": 0.9, "yaw'))
     return path
 
 
@@ -46,19 +42,8 @@ def test_labels_as_predictions_are_perfect_by_iou_and_distance(root: Path, perfe
     report = json.loads((out / "iou.json").read_text())
     assert {score["class_name"] for score in report["iou"]} == {"Car", "Forklift"}
     assert {score["ap"] for score in report["iou"] if score["band"] == "all"} == {100.0}
-    invoke(
-        "eval",
-        "--data",
-        root,
-        "--predictions",
-        perfect,
-        "--out",
-        out,
-        "--protocol",
-        "distance",
-        "--json",
-        tmp_path / "d.json",
-    )
+    options = ("--protocol", "distance", "--json", tmp_path / "d.json")
+    invoke("eval", "--data", root, "--predictions", perfect, "--out", out, *options)
     report = json.loads((tmp_path / "d.json").read_text())
     assert report == json.loads((out / "distance.json").read_text())
     assert [round(score["cds"]) for score in report["argoverse2"]] == [100, 100]
@@ -128,11 +113,8 @@ def test_kitti_data_is_scored_too(tmp_path: Path) -> None:
     root = write_dataset(tmp_path / "kitti", 2)
     invoke("eval", "--data", root, "--out", tmp_path / "out", "--protocol", "distance")
     report = json.loads((tmp_path / "out" / "distance.json").read_text())
-    assert {score["class_name"]: score["objects"] for score in report["argoverse2"]} == {
-        "Car": 2,
-        "Pedestrian": 1,
-        "Cyclist": 1,
-    }
+    objects = {score["class_name"]: score["objects"] for score in report["argoverse2"]}
+    assert objects == {"Car": 2, "Pedestrian": 1, "Cyclist": 1}
 
 
 @pytest.mark.parametrize("camera_view", [True, False])
@@ -190,33 +172,32 @@ def test_frames_without_predictions_are_named(root: Path, perfect: Path, tmp_pat
 
 
 @pytest.mark.parametrize(
-    ("arguments", "message"),
+    ("options", "message"),
     [
-        (["--protocol", "iou"], "needs the labels: give --data"),
-        (["--protocol", "kitti", "--data", "{root}"], "has no camera, which it needs; choose iou or distance"),
-        (["--data", "{root}", "--around", "--predictions", "x"], "--around runs a model"),
-        (["--data", "{root}", "--around", "--protocol", "waymo"], "--around needs labels in every direction"),
-        (["run.ckpt", "--data", "{root}", "--around"], "--around runs bundles: export the checkpoint first"),
-        (["--data", "{root}", "--gallery", "3"], "--gallery 3 belongs to --protocol kitti"),
-        (["--data", "{root}", "--labels", "x"], "--labels x belongs to"),
-        (["--data", "{root}", "--min-score", "0.9"], "of Car is below --min-score 0.9"),
-        (["--data", "{root}", "--score", "0.01"], "score 0.01 of Car is below --min-score 0.05"),
-        (["--data", "{root}", "--score", "5"], "--score 5: no detection of a model has such a score"),
-        (["--data", "{root}", "--predictions", "x", "--provider", "y"], "--provider y is for running a model"),
-        (["--data", "{root}", "--predictions", "x", "--precision", "y"], "--precision y is for running a model"),
-        (["--data", "{root}", "--predictions", "x", "--min-score", "0.9"], "--min-score 0.9 is for running a model"),
-        (["--data", "{root}", "--predictions", "x", "--threads", "2"], "--threads 2 is for running a model"),
-        (["--split", "training", "--predictions", "x", "--labels", "y"], "--split training is a list of the frames of"),
-        (["--data", "{root}", "--score", "nan"], "--score nan must be a number"),
-        (["--data", "{root}", "--predictions", "{root}/none.jsonl", "--json", "{root}"], "is a folder"),
-        (["--data", "{root}", "--predictions", "{root}/labels.jsonl"], "labels.jsonl:2, box 1: no `score`"),
-        (["--data", "{root}", "--predictions", "{root}/none.jsonl"], "none.jsonl: cannot be read"),
+        ("--protocol iou", "needs the labels: give --data"),
+        ("--protocol kitti --data {root}", "has no camera, which it needs; choose iou or distance"),
+        ("--data {root} --around --predictions x", "--around runs a model"),
+        ("--data {root} --around --protocol waymo", "--around needs labels in every direction"),
+        ("run.ckpt --data {root} --around", "--around runs bundles: export the checkpoint first"),
+        ("--data {root} --gallery 3", "--gallery 3 belongs to --protocol kitti"),
+        ("--data {root} --labels x", "--labels x belongs to"),
+        ("--data {root} --min-score 0.9", "of Car is below --min-score 0.9"),
+        ("--data {root} --score 0.01", "score 0.01 of Car is below --min-score 0.05"),
+        ("--data {root} --score 5", "--score 5: no detection of a model has such a score"),
+        ("--data {root} --predictions x --provider y", "--provider y is for running a model"),
+        ("--data {root} --predictions x --precision y", "--precision y is for running a model"),
+        ("--data {root} --predictions x --min-score 0.9", "--min-score 0.9 is for running a model"),
+        ("--data {root} --predictions x --threads 2", "--threads 2 is for running a model"),
+        ("--split training --predictions x --labels y", "--split training is a list of the frames of"),
+        ("--data {root} --score nan", "--score nan must be a number"),
+        ("--data {root} --predictions {root}/none.jsonl --json {root}", "is a folder"),
+        ("--data {root} --predictions {root}/labels.jsonl", "labels.jsonl:2, box 1: no `score`"),
+        ("--data {root} --predictions {root}/none.jsonl", "none.jsonl: cannot be read"),
     ],
 )
-def test_what_cannot_be_is_refused(root: Path, tmp_path: Path, arguments: list[str], message: str) -> None:
-    (root / "none.jsonl").unlink(missing_ok=True)
+def test_what_cannot_be_is_refused(root: Path, tmp_path: Path, options: str, message: str) -> None:
     with pytest.raises(AscaError) as caught:
-        invoke("eval", *(text.format(root=root) for text in arguments), "--out", tmp_path / "out")
+        invoke("eval", *options.format(root=root).split(), "--out", tmp_path / "out")
     assert message in str(caught.value) and "\n" not in str(caught.value)
 
 

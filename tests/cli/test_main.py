@@ -3,10 +3,8 @@
 import json
 import os
 import shutil
-import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import cv2
@@ -20,29 +18,14 @@ from asca_deploy import Detector, sample_scan_path
 from asca_pillars.base.installation import install_command
 from asca_pillars.base.schema import to_dict
 from asca_pillars.cli.main import app
-from asca_pillars.data.kitti import KittiSplit, read_labels
 from asca_pillars.scans.scan_reader import read_scan, write_scan
+from tests.helpers.hidden_modules import hiding
 from tests.helpers.in_process import run_here
 from tests.helpers.scenes import make_scene, write_dataset
 from tests.helpers.tiny_run import CONFIG
 
-WITHOUT_TORCH = """
-import sys
-from importlib.machinery import PathFinder
-
-class BaseInstall(PathFinder):
-    @classmethod
-    def find_spec(cls, name, *rest):
-        heavy = {"torch", "lightning", "onnx", "onnxscript", "tensorboard", "sklearn", "scipy"}
-        heavy |= {"matplotlib", "openvino", "rosbags", "mcap", "rerun"}
-        if name.split(".")[0] in heavy:
-            return None
-        return super().find_spec(name, *rest)
-
-sys.meta_path = [BaseInstall if finder is PathFinder else finder for finder in sys.meta_path]
-from asca_pillars.cli.main import main
-main()
-"""
+HEAVY = "torch lightning onnx onnxscript tensorboard sklearn scipy matplotlib openvino rosbags mcap rerun"
+WITHOUT_TORCH = hiding(HEAVY, "from asca_pillars.cli.main import main\nmain()")
 
 
 def asca(*arguments: object, cwd: Path | None = None, code: str = WITHOUT_TORCH) -> subprocess.CompletedProcess:
@@ -96,31 +79,6 @@ def test_detect_finds_boxes_in_the_sample_without_torch(tmp_path: Path) -> None:
     assert np.asarray(cv2.imread(str(out / "street_bev.png"))).shape[1] >= 500
 
 
-def test_detect_writes_kitti_text_and_overlays_where_there_is_a_calibration(tmp_path: Path) -> None:
-    root = write_dataset(tmp_path / "kitti", 3)
-    split = KittiSplit(root)
-    split.image_path("000001").parent.mkdir()
-    cv2.imwrite(str(split.image_path("000001")), np.full((375, 1242, 3), 90, np.uint8))
-    split.calib_path("000002").unlink()
-    result = asca("detect", root / "training" / "velodyne", "--out", tmp_path / "out", "--score", 0.02)
-    assert result.returncode == 0, result.stderr
-    names = {path.name for path in (tmp_path / "out").iterdir()}
-    assert {"000000.txt", "000001.txt", "000001_image.png"} <= names
-    assert "000002.txt" not in names and "000000_image.png" not in names
-    for frame_id in ("000000", "000001"):
-        for item in read_labels(tmp_path / "out" / f"{frame_id}.txt"):
-            assert item.score is not None and 0 <= item.bbox[0] < item.bbox[2] <= 1242
-
-
-def test_bench_reports_stages_and_machine(tmp_path: Path) -> None:
-    result = asca("bench", "--rounds", 2, "--json", tmp_path / "report.json")
-    assert result.returncode == 0, result.stderr
-    report = json.loads((tmp_path / "report.json").read_text())
-    assert set(report["stages_ms"]) == {"input", "pillarize", "encode", "tables", "neck+head", "decode"}
-    assert report["fps"] == pytest.approx(1000 / report["total_ms"]["p50"])
-    assert report["cpu"] and report["threads"] >= 1 and report["cold_ms"] > 0
-
-
 def test_doctor_names_the_missing_extras() -> None:
     result = asca("doctor")
     assert result.returncode == 0, result.stderr
@@ -130,27 +88,22 @@ def test_doctor_names_the_missing_extras() -> None:
     assert "auto takes cpu int8" in result.stdout
 
 
-@pytest.mark.parametrize(
-    ("name", "content", "message"),
-    [
-        ("truncated.bin", b"\0" * 30, "truncated.bin"),
-        ("empty.bin", b"", "empty"),
-        ("scan.las", b"x", "unknown suffix '.las'"),
-        ("bad.pcd", b"VERSION .7\nFIELDS a b\n", "bad.pcd"),
-    ],
-)
-def test_detect_refuses_bad_scans_in_one_line(tmp_path: Path, name: str, content: bytes, message: str) -> None:
-    (tmp_path / name).write_bytes(content)
-    assert message in refusal(run_here("detect", tmp_path / name, cwd=tmp_path))
+def test_detect_refuses_bad_scans_in_one_line(tmp_path: Path) -> None:
+    for name, message in (("truncated.bin", "truncated.bin: 1 byte"), ("scan.las", "unknown suffix '.las'")):
+        (tmp_path / name).write_bytes(b"x")
+        assert message in refusal(run_here("detect", tmp_path / name, cwd=tmp_path))
     assert not (tmp_path / "detections").exists()
 
 
 def test_detect_refuses_what_is_not_there(tmp_path: Path) -> None:
     assert "no such file or folder" in refusal(asca("detect", tmp_path / "none.bin"))
-    assert "bundle.json" in refusal(run_here("detect", "--bundle", tmp_path, cwd=tmp_path))
-    assert "unknown provider 'gpu'" in refusal(run_here("detect", "--provider", "gpu", cwd=tmp_path))
-    assert "unknown precision 'half'" in refusal(run_here("detect", "--precision", "half", cwd=tmp_path))
-    assert "threads" in refusal(run_here("detect", "--threads", 0, cwd=tmp_path))
+    for option, value, message in (
+        ("--bundle", tmp_path, "bundle.json"),
+        ("--provider", "gpu", "unknown provider 'gpu'"),
+        ("--precision", "half", "unknown precision 'half'"),
+        ("--threads", 0, "threads"),
+    ):
+        assert message in refusal(run_here("detect", option, value, cwd=tmp_path))
 
 
 def test_a_scan_without_points_gives_no_boxes(tmp_path: Path) -> None:
@@ -178,16 +131,8 @@ def test_train_refuses_typos_and_missing_data(tmp_path: Path) -> None:
     assert not (tmp_path / "run").exists()
 
 
-def test_export_refuses_what_is_no_checkpoint(tmp_path: Path) -> None:
-    assert "no such checkpoint" in refusal(run_here("export", tmp_path / "none.ckpt", "-o", tmp_path / "b"))
-    (tmp_path / "damaged.ckpt").write_bytes(b"not a checkpoint")
-    assert "damaged.ckpt: not a checkpoint" in refusal(
-        run_here("export", tmp_path / "damaged.ckpt", "-o", tmp_path / "b")
-    )
-
-
 def test_from_training_to_boxes(tmp_path: Path) -> None:
-    """train, export, detect: every command takes what the one before it wrote; a killed export leaves nothing."""
+    """train, export, detect: every command takes what the one before it wrote."""
     data = write_dataset(tmp_path / "data", 4)
     (tmp_path / "config.yaml").write_text(yaml.safe_dump(to_dict(CONFIG)))
     run, bundle = tmp_path / "run", tmp_path / "bundle"
@@ -198,17 +143,7 @@ def test_from_training_to_boxes(tmp_path: Path) -> None:
         write_scan(scans / f"{seed}.bin", make_scene(seed)[0])
     export = ("export", run / "checkpoints" / "last.ckpt", "-o", bundle, "--scans", scans)
 
-    command = [sys.executable, "-c", "from asca_pillars.cli.main import main; main()", *map(str, export)]
-    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    while not list(tmp_path.glob(".bundle.asca-*")):
-        assert process.poll() is None, "the export ended before it could be killed"
-        time.sleep(0.01)
-    os.kill(process.pid, signal.SIGKILL)
-    process.wait()
-    assert not bundle.exists()
-
     assert "Pedestrain: no such class; there are" in refusal(run_here(*export, "--score", "Pedestrain=0.2"))
-    assert "such as Car=0.35" in refusal(run_here(*export, "--score", "Car:0.2"))
     exported = run_here(*export, "--score", "Pedestrian=0.21", "--with-weights")
     assert exported.returncode == 0, exported.stderr
     assert (bundle / "weights.ckpt").read_bytes() == (run / "checkpoints" / "weights.ckpt").read_bytes()
@@ -218,9 +153,6 @@ def test_from_training_to_boxes(tmp_path: Path) -> None:
         file.write(b"bits")
     torn = run_here("export", tmp_path / "torn", "-o", tmp_path / "of_torn", "--scans", scans)
     assert "weights.ckpt: is damaged, or of another bundle" in refusal(torn)
-    golden = ("export", bundle, "--golden", "-o", tmp_path / "golden")
-    assert run_here(*golden).returncode == 0
-    assert "--with-weights is for a checkpoint" in refusal(run_here(*golden, "--with-weights"))
     assert "parity on 8 scans" in exported.stdout
     manifest = json.loads((bundle / "bundle.json").read_text())
     assert manifest["provenance"]["command"].startswith("asca train")

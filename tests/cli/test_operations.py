@@ -1,8 +1,10 @@
-"""What programs that run `asca` go by: exit codes, JSON, deadlines, and what results say about the model."""
+"""What programs that run `asca` go by: errors, exit codes, JSON, deadlines, what results say about the model."""
 
 import errno
 import json
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +13,7 @@ import typer
 
 from asca_deploy import Detector, default_bundle_path
 from asca_pillars.base import errors
-from asca_pillars.cli import doctor_checks
+from asca_pillars.cli import doctor
 from asca_pillars.cli.run_command import run_command
 from asca_pillars.scans.scan_reader import write_scan
 from tests.helpers.in_process import run_here
@@ -25,15 +27,17 @@ KINDS: dict[int, set[type[errors.AscaError]]] = {
 }
 
 
-def code_of(error: BaseException) -> int:
+def failed(error: BaseException, name: str | None = "asca") -> int:
+    """The exit code of a command with this error, of which it prints one line."""
+
     def fail() -> None:
         raise error
 
     app = typer.Typer()
     app.command()(fail)
     with pytest.MonkeyPatch.context() as patch, pytest.raises(SystemExit) as ended:
-        patch.setattr("sys.argv", ["asca"])
-        run_command(app, "asca")
+        patch.setattr("sys.argv", ["benchmarks/memory.py"])
+        run_command(app, name)
     assert isinstance(ended.value.code, int)
     return ended.value.code
 
@@ -42,10 +46,43 @@ def test_every_kind_of_error_has_its_exit_code() -> None:
     classes = [one for one in vars(errors).values() if isinstance(one, type) and issubclass(one, errors.AscaError)]
     assert {kind for own in KINDS.values() for kind in own} == set(classes)
     for code, own in KINDS.items():
-        assert {code_of(kind("said")) for kind in own} == {code}
+        assert {failed(kind("said")) for kind in own} == {code}
         assert f"| {code} |" in DEPLOY.read_text()
-    assert code_of(FileNotFoundError(errno.ENOENT, "no such file", "x")) == 4
-    assert code_of(OSError(errno.ENOSPC, "disk full", "x")) == code_of(MemoryError()) == 5
+    assert failed(FileNotFoundError(errno.ENOENT, "no such file", "x")) == 4
+
+
+@pytest.mark.parametrize(
+    ("error", "line", "code"),
+    [
+        (errors.ScanError("a.pcd: TYPE \x1b[2J\n"), r"a.pcd: TYPE \x1b[2J\n", 4),
+        (MemoryError("Unable to allocate 46.6 GiB"), "not enough memory (Unable to allocate 46.6 GiB); ", 5),
+        (RecursionError("deep"), "the input is nested too deeply", 4),
+        (OSError(28, "No space left on device", "a.ckpt"), "a.ckpt: No space left on device", 5),
+    ],
+)
+@pytest.mark.parametrize("name", ["asca", None])
+def test_errors_are_one_line(
+    error: Exception, line: str, code: int, name: str | None, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert failed(error, name) == code
+    printed = capsys.readouterr().err
+    assert printed.startswith(f"{name or 'memory'}: {line}") and printed.count("\n") == 1
+
+
+def test_a_defect_keeps_its_traceback() -> None:
+    with pytest.raises(ZeroDivisionError):
+        failed(ZeroDivisionError())
+
+
+def test_a_terminal_that_knows_ascii_only_gets_the_table(tmp_path: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "asca_pillars.cli", "detect", "-o", str(tmp_path / "out")],
+        env={"PYTHONIOENCODING": "ascii", "PYTHONPATH": ":".join(sys.path), "PATH": ""},
+        capture_output=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr.decode()
+    assert b"heading" in done.stdout and b"?" in done.stdout
 
 
 def test_a_scan_that_cannot_be_read_makes_a_run_partial(tmp_path: Path) -> None:
@@ -74,7 +111,7 @@ def test_doctor_as_json_says_whether_the_model_runs() -> None:
         raise errors.BundleError("damaged")
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(doctor_checks, "_bundled_model", broken)
+        patch.setattr(doctor, "_bundled_model", broken)
         done = run_here("doctor")
     assert done.returncode == 1 and "damaged" in done.stdout
 

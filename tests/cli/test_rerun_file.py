@@ -3,8 +3,8 @@
 import sys
 from collections import Counter
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
+from unittest.mock import MagicMock
 
 import cv2
 import numpy as np
@@ -20,14 +20,7 @@ from asca_pillars.base.errors import ConfigError, OutputError, ScanError
 from asca_pillars.cli.detect import detect
 from asca_pillars.pictures.colors import class_rgb
 from tests.cli.short_drive import SCANS, run
-from tests.scans.recordings.cloud_recordings import (
-    clouds,
-    compressed_image,
-    image_message,
-    stamps,
-    store,
-    write_mcap,
-)
+from tests.scans.recordings.cloud_recordings import clouds, compressed_image, image_message, stamps, store, write_mcap
 
 
 def test_rerun_file_is_read_back(drive: Path, tmp_path: Path) -> None:
@@ -132,28 +125,11 @@ def test_what_rerun_cannot_write_ends_the_run(
 ) -> None:
     """Its library reports a full disk when it is asked to flush, and waits forever when it is asked to disconnect."""
 
-    class Stream:
-        def __init__(self, name: str) -> None:
-            assert name
-
-        def flush(self, *, timeout_sec: float) -> None:
-            assert timeout_sec > 0
-            raise RuntimeError("File-writer thread shut down prematurely")
-
-        def disconnect(self) -> None:
-            pytest.fail("it would wait forever")
-
-        def save(self, path: Path) -> None:
-            path.write_bytes(b"")
-
-        def __getattr__(self, _: str) -> Any:
-            return lambda *_, **__: None
-
-    def nothing(*_: Any, **__: Any) -> None:
-        """Stands for what is logged."""
-
-    made = SimpleNamespace(RecordingStream=Stream, Points3D=nothing, Boxes3D=nothing, Arrows3D=nothing)
-    made.blueprint = SimpleNamespace(Blueprint=nothing, Spatial3DView=nothing)
+    made = MagicMock()
+    stream = made.RecordingStream.return_value
+    stream.flush.side_effect = RuntimeError("File-writer thread shut down prematurely")
+    stream.disconnect.side_effect = AssertionError("it would wait forever")
+    stream.save.side_effect = lambda path: path.write_bytes(b"")
     monkeypatch.setitem(sys.modules, "rerun", made)
     monkeypatch.setitem(sys.modules, "rerun.blueprint", made.blueprint)
     monkeypatch.setattr(sequence_files, "require", lambda extra: None)

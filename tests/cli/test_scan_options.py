@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 from typer.testing import CliRunner, Result
 
 from asca_deploy import sample_scan_path
-from asca_pillars.base.errors import AscaError, ConfigError, ScanError
+from asca_pillars.base.errors import AscaError, ScanError
 from asca_pillars.cli.main import app
 from asca_pillars.cli.options import scan_settings
 from asca_pillars.scans.mounting import Mounting
 from asca_pillars.scans.scan_input import ScanInput
 from asca_pillars.scans.scan_reader import read_scan, write_scan
-from asca_pillars.scans.scan_settings import ScanSettings
+from asca_pillars.scans.scan_settings import ScanSettings, sample_points
 
 
 def detect(tmp_path: Path, *arguments: object) -> tuple[Result, list[dict]]:
@@ -98,43 +98,21 @@ def test_the_height_of_several_scans(tmp_path: Path, sample: NDArray[np.float32]
     assert any("from 3 scans" in text for text in scan_input.notes)
 
 
-def write_folder(folder: Path, sample: NDArray[np.float32], shown: list[bool]) -> Path:
-    """Scans of a street, and as many points of a wall where none is to be shown."""
-    wall = sample[::10].copy()
-    wall[:, 0] = 5.0
-    for number, street in enumerate(shown):
-        write_scan(folder / f"{number:03}.bin", sample[::4] if street else wall)
-    return folder
+def test_scans_that_are_spread_over_all_are_looked_at_first_and_then_those_between() -> None:
+    def read(path: Path) -> NDArray[np.float32]:
+        if path.name == "5":
+            raise ScanError("damaged")
+        return np.zeros((int(path.name != "10"), 4), np.float32)
 
-
-@pytest.mark.parametrize(
-    ("shown", "estimated", "left_out"),
-    [
-        ([False, True, True], 2, "000.bin: "),
-        ([True, False, False], 1, "001.bin: "),
-        ([False] * 16 + [True], 1, "000.bin: "),  # between those that are looked at first
-        ([True, False, True] * 9, 8, ".bin: "),
-    ],
-)
-def test_a_scan_without_ground_is_left_out_of_the_height(
-    tmp_path: Path, sample: NDArray[np.float32], shown: list[bool], estimated: int, left_out: str
-) -> None:
-    folder = write_folder(tmp_path / "sweeps", sample, shown)
-    scan_input = ScanInput(ScanSettings(sensor_height="auto"), sorted(folder.iterdir()))
-    assert scan_input.mounting.sensor_height_m == pytest.approx(1.73, abs=0.05)
-    (note,) = [text for text in scan_input.notes if text.startswith("sensor height: ")]
-    assert f"from {estimated} scan" in note
-    assert left_out in note.split("; left out: ")[1]
-
-
-def test_a_height_is_refused_where_no_scan_shows_the_ground(tmp_path: Path, sample: NDArray[np.float32]) -> None:
-    folder = write_folder(tmp_path / "walls", sample, [False] * 40)
-    with pytest.raises(ScanError, match=r"from .*000\.bin: .* \(and 31 more\); give the height in metres"):
-        ScanInput(ScanSettings(sensor_height="auto"), sorted(folder.iterdir()))
+    names = [int(name) for name, _ in sample_points([Path(f"{number}") for number in range(40)], read)]
+    assert names == [*(0, 15, 20, 25, 30, 35), *range(1, 40, 5), *range(2, 40, 5), *range(3, 40, 5)]
 
 
 def test_detect_goes_on_with_a_scan_without_ground(tmp_path: Path, sample: NDArray[np.float32]) -> None:
-    folder = write_folder(tmp_path / "sweeps", sample, [True, False])
+    folder, wall = tmp_path / "sweeps", sample[::10].copy()
+    wall[:, 0] = 5.0
+    for name, points in (("000.bin", sample[::4]), ("001.bin", wall)):
+        write_scan(folder / name, points)
     result, lines = detect(tmp_path, folder, "--sensor-height", "auto", "--no-pictures", "-b", "fast")
     assert result.exit_code == 0 and len(lines) == 2, "the height is left out, the boxes are not"
     assert "left out: " in result.output and "001.bin" in result.output
@@ -158,9 +136,3 @@ def test_wrong_options(options: dict[str, Any], message: str) -> None:
     unset = {"sensor_height": None, "axes": "x-forward", "pose": None, "reflectance_scale": "auto", "columns": None}
     with pytest.raises(AscaError, match=message):
         ScanInput(scan_settings(**(unset | options)), [sample_scan_path()])
-
-
-def test_bench_does_not_mix_passes_and_matrix() -> None:
-    result = CliRunner().invoke(app, ["bench", "--around", "--matrix"])
-    assert isinstance(result.exception, ConfigError)
-    assert "single passes" in str(result.exception)

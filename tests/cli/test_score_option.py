@@ -11,7 +11,7 @@ from asca_pillars.base.errors import ConfigError
 from asca_pillars.cli.options import read_scores
 from asca_pillars.evaluation.model import scores_by_class
 from asca_pillars.scans.scan_reader import read_scan
-from tests.helpers.in_process import run_here
+from tests.helpers.in_process import invoke, run_here
 
 BUNDLE = "fast"
 
@@ -20,9 +20,7 @@ BUNDLE = "fast"
     ("texts", "scores"),
     [
         (None, None),
-        ([], None),
         (["0.4"], 0.4),
-        (["Car=0.4"], {"Car": 0.4}),
         (["Car=0.4", "Van=with=sign=1e-1"], {"Car": 0.4, "Van=with=sign": 0.1}),
         (["Car=0.4", "Car=0.5"], {"Car": 0.5}),
     ],
@@ -31,15 +29,15 @@ def test_scores_as_typed(texts: list[str] | None, scores: Any) -> None:
     assert read_scores(texts) == scores
 
 
-@pytest.mark.parametrize("texts", [["high"], ["Car="], ["=0.4"], ["Car=high"], [""]])
-def test_what_is_no_score(texts: list[str]) -> None:
-    with pytest.raises(ConfigError, match=r"such as Car=0\.35"):
-        read_scores(texts)
-
-
-@pytest.mark.parametrize("texts", [["0.4", "Car=0.5"], ["Car=0.5", "0.4"], ["0.4", "0.5"]])
-def test_a_score_of_every_class_stands_alone(texts: list[str]) -> None:
-    with pytest.raises(ConfigError, match="is for every class; give it alone"):
+@pytest.mark.parametrize(
+    ("texts", "message"),
+    [
+        *(([text], r"such as Car=0\.35") for text in ("high", "Car=", "=0.4", "Car=high", "")),
+        *((texts, "is for every class; give it alone") for texts in (["0.4", "Car=0.5"], ["Car=0.5", "0.4"])),
+    ],
+)
+def test_what_is_no_score(texts: list[str], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
         read_scores(texts)
 
 
@@ -53,10 +51,8 @@ def test_the_others_keep_their_own() -> None:
 
 
 def test_detect_and_the_detector_agree(tmp_path: Path) -> None:
-    found = run_here(
-        "detect", "-b", BUNDLE, "-o", tmp_path, "--no-pictures", "--score", "Car=0.9", "--score", "Cyclist=0.2"
-    )
-    assert found.returncode == 0, found.stderr
+    scores = ("--score", "Car=0.9", "--score", "Cyclist=0.2")
+    invoke("detect", "-b", BUNDLE, "-o", tmp_path, "--no-pictures", *scores)
     boxes = json.loads((tmp_path / "street.json").read_text())["boxes"]
     detector = Detector(BUNDLE, score_threshold={"Car": 0.9, "Cyclist": 0.2})
     expected = detector(read_scan(sample_scan_path()).points)
@@ -72,7 +68,6 @@ def test_detect_and_the_detector_agree(tmp_path: Path) -> None:
     [
         ("Lorry=0.4", "Lorry: no such class; there are Car, Pedestrian, Cyclist"),
         ("Car=1.5", "score_threshold 1.5 of class Car must lie between 0 and 1"),
-        ("Car=nan", "must lie between 0 and 1"),
         ("Car:0.4", "such as Car=0.35"),
     ],
 )
@@ -85,8 +80,7 @@ def test_mistakes_are_one_line(tmp_path: Path, score: str, message: str) -> None
 
 def test_evaluation_counts_from_the_score_of_each_class(tmp_path: Path, texts: dict[str, Any]) -> None:
     given = ["--predictions", texts["predictions"], "--labels", texts["labels"], "-o", tmp_path / "out"]
-    result = run_here("eval", *given, "--score", "Car=0.95")
-    assert result.returncode == 0, result.stderr
+    invoke("eval", *given, "--score", "Car=0.95")
     points = json.loads((tmp_path / "out" / "report.json").read_text())["operating_points"]
     assert {point["class_name"]: point["score"] for point in points} == {"Car": 0.95, "Pedestrian": 0.3, "Cyclist": 0.3}
     found = {point["class_name"]: point["found"] for point in points if point["band_m"] is None}

@@ -75,10 +75,8 @@ def test_a_bad_moment_of_the_file_system_is_waited_out_and_a_full_disk_is_not() 
         tries[shard.name] += 1
         return done(shard) if tries[shard.name] > good_after else Outcome(shard, error=OSError("no space"))
 
-    assert [one.result for one in process_shards(make_shards([1, 2], 1), MadeUpPool(lambda shard: end(shard, 2)))] == [
-        2,
-        1,
-    ]
+    outcomes = process_shards(make_shards([1, 2], 1), MadeUpPool(lambda shard: end(shard, 2)))
+    assert [one.result for one in outcomes] == [2, 1]
     tries.clear()
     with pytest.raises(OSError, match="no space"):
         list(process_shards([Shard(0, (1,))], MadeUpPool(lambda shard: end(shard, 3))))

@@ -106,12 +106,7 @@ def test_other_settings_are_refused_and_the_size_stays(tmp_path: Path) -> None:
         folder.begin({"score": 0.5, "mounting": {"axes": "x-forward"}}, 16)
     with pytest.raises(OutputError, match="tilt = None, now 1"):
         folder.begin({"score": None, "mounting": {"axes": "x-forward"}, "tilt": 1}, 16)
-    for text in (
-        "{",
-        "[]",
-        json.dumps({"shard_size": "many", "settings": {}}),
-        json.dumps({"shard_size": 4, "settings": []}),
-    ):
+    for text in ("{", "[]", '{"shard_size": "many", "settings": {}}', '{"shard_size": 4, "settings": []}'):
         (tmp_path / "shards" / "run.json").write_text(text)
         with pytest.raises(OutputError, match="is damaged"):
             folder.begin({}, 16)

@@ -197,6 +197,14 @@ def sparse_bundle(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_bundle(tmp_path_factory.mktemp("bundles") / "sparse", active_cells="sub")
 
 
+@pytest.fixture(params=["dense", "sparse", "other direction bins"])
+def any_bundle(request: pytest.FixtureRequest, tiny_bundle: Path, sparse_bundle: Path, tmp_path: Path) -> Path:
+    """Bundles for implementations in other languages; no test changes them."""
+    if request.param == "other direction bins":
+        return write_bundle(tmp_path / "turned", spec=replace(SPEC, direction_offset_rad=-np.pi / 2))
+    return sparse_bundle if request.param == "sparse" else tiny_bundle
+
+
 @pytest.fixture
 def bundle_copy(tiny_bundle: Path, tmp_path: Path) -> Path:
     """A good bundle for the test to spoil."""

@@ -1,16 +1,23 @@
-"""Which passes there are, and how their boxes become one list."""
+"""When a detector looks all around, which passes there are, and how their boxes become one list."""
+
+from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from asca_deploy import sample_scan_path
 from asca_deploy.around import about_ground, merge, ranges_around, turns_around
+from asca_deploy.open_model import RuntimeOptions, files_need_around
 from asca_pillars.base.errors import ConfigError
 from asca_pillars.detection.detections import Detections
 from asca_pillars.geometry.boxes import wrap_angle
 from asca_pillars.geometry.frame_change import FrameChange
 from asca_pillars.geometry.ranges import Ranges
+from asca_pillars.scans.scan_input import ScanInput
+from asca_pillars.scans.scan_reader import read_scan
+from asca_pillars.scans.scan_settings import ScanSettings
 
 Z_M = (-3.0, 1.0)
 KITTI = Ranges((0.0, 69.12), (-30.72, 30.72), Z_M)
@@ -117,3 +124,26 @@ def test_without_a_ground_the_passes_turn_about_z() -> None:
     for points in (cloud, cloud[:0]):
         for turn, plain in zip(about_ground(turns, points), turns, strict=True):
             np.testing.assert_array_equal(turn.axes, plain.axes)
+
+
+def test_scans_all_around_the_sensor_are_looked_at_in_every_direction(tmp_path: Path) -> None:
+    """Also where x is not forward; a camera's part of a scan, and KITTI's frames, are looked at ahead."""
+    revolution = read_scan(sample_scan_path()).points
+    turned = np.column_stack([-revolution[:, 1], revolution[:, 0], revolution[:, 2:]])  # x right, y forward
+    part = revolution[np.abs(np.arctan2(revolution[:, 1], revolution[:, 0])) < 0.7]
+    for points, axes, expected in [
+        (revolution, "x-forward", True),
+        (turned, "y-forward", True),
+        (part, "x-forward", False),
+    ]:
+        path = tmp_path / "scan.npy"
+        np.save(path, points)
+        scan_input = ScanInput(ScanSettings(axes=axes), [path])
+        assert files_need_around(RuntimeOptions(), scan_input) == expected
+        assert [line for line in scan_input.notes if "looking all around, in 4 passes (--ahead" in line] or not expected
+    in_kitti_layout = tmp_path / "velodyne" / "000000.bin"
+    for file in (in_kitti_layout, tmp_path / "calib" / "000000.txt"):
+        file.parent.mkdir()
+        file.touch()
+    revolution.tofile(in_kitti_layout)
+    assert not files_need_around(RuntimeOptions(), ScanInput(ScanSettings(), [in_kitti_layout]))

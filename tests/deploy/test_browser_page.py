@@ -242,17 +242,6 @@ def test_the_zip_is_the_page_with_the_license_of_its_runtime(made_up_package: Pa
     assert len(held[f"page/{ORT_NOTICES}"]) > 1000
 
 
-def test_a_zip_of_something_else_is_left_alone(made_up_package: Path, tmp_path: Path) -> None:
-    bundle, zipped = DENSE_INT8, tmp_path / "page.zip"
-    with zipfile.ZipFile(zipped, "w") as archive:
-        archive.writestr("page/page.json", "{}")
-    for content in (zipped.read_bytes(), b"precious"):
-        zipped.write_bytes(content)
-        with pytest.raises(OutputError, match=r"page\.zip: `asca export --browser` did not write it"):
-            write_page(tmp_path / "page", bundle, sample_scan_path(), made_up_package)
-        assert zipped.read_bytes() == content and not (tmp_path / "page").exists()
-
-
 @pytest.mark.parametrize("name", ["index.html", "main.js", "page.json", "sample.bin", "évil .mjs"])
 def test_a_stranger_s_names_of_graphs_do_not_reach_the_page(made_up_package: Path, tmp_path: Path, name: str) -> None:
     """Bytes of a graph may well be a script, and a page would run it."""
@@ -268,9 +257,17 @@ def test_a_stranger_s_names_of_graphs_do_not_reach_the_page(made_up_package: Pat
     assert {path.name: path.read_bytes() for path in page.iterdir()} == usual
 
 
-def test_what_is_read_is_not_replaced(made_up_package: Path, tmp_path: Path) -> None:
+def test_what_is_read_and_what_others_wrote_is_not_replaced(made_up_package: Path, tmp_path: Path) -> None:
     """A page is a bundle, too."""
-    page, bundle = tmp_path / "page", DENSE_INT8
+    page, bundle, zipped = tmp_path / "page", DENSE_INT8, tmp_path / "page.zip"
+    with zipfile.ZipFile(zipped, "w") as archive:
+        archive.writestr("page/page.json", "{}")
+    for content in (zipped.read_bytes(), b"precious"):
+        zipped.write_bytes(content)
+        with pytest.raises(OutputError, match=r"page\.zip: `asca export --browser` did not write it"):
+            write_page(page, bundle, sample_scan_path(), made_up_package)
+        assert zipped.read_bytes() == content and not page.exists()
+    zipped.unlink()
     write_page(page, bundle, sample_scan_path(), made_up_package)
     before = {path.name: path.read_bytes() for path in page.iterdir()}
     for read in ((page, sample_scan_path()), (bundle, page / "sample.bin")):
@@ -280,6 +277,10 @@ def test_what_is_read_is_not_replaced(made_up_package: Path, tmp_path: Path) -> 
     with pytest.raises(OutputError, match=r"page\.json: `asca export --browser` did not write it"):
         write_page(page, bundle, sample_scan_path(), made_up_package)
     assert {path.name for path in page.iterdir()} == set(before)
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "thesis.txt").write_text("precious")
+    with pytest.raises(OutputError, match=r"thesis\.txt"):
+        write_page(tmp_path / "mine", bundle, sample_scan_path(), made_up_package)
 
 
 def test_a_package_that_is_none(made_up_package: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -295,13 +296,6 @@ def test_a_package_that_is_none(made_up_package: Path, tmp_path: Path, monkeypat
         with pytest.raises(ConfigError, match=message):
             write_page(tmp_path / "page", bundle, sample_scan_path(), package)
     assert not (tmp_path / "page").exists()
-
-
-def test_a_folder_of_something_else_is_left_alone(made_up_package: Path, tmp_path: Path) -> None:
-    (tmp_path / "page").mkdir()
-    (tmp_path / "page" / "thesis.txt").write_text("precious")
-    with pytest.raises(OutputError, match=r"thesis\.txt"):
-        write_page(tmp_path / "page", DENSE_FLOAT32, sample_scan_path(), made_up_package)
 
 
 def test_a_bundle_that_the_page_cannot_run(made_up_package: Path, tmp_path: Path, monkeypatch) -> None:

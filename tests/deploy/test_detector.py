@@ -13,6 +13,7 @@ from asca_deploy.manifest import load_pillar_bundle
 from asca_pillars.base.errors import BundleError, ConfigError, ScanError
 from asca_pillars.detection.decode import HeadMaps
 from asca_pillars.ops.pillar.prepare import PillarCounts
+from asca_pillars.scans.mounting import Mounting
 from tests.deploy.conftest import STAGES, make_scan
 from tests.helpers.same_detections import same
 
@@ -34,12 +35,12 @@ def detect_by_hand(bundle: Path, points: Points) -> Detections:
     return spec.decode(HeadMaps(*(channels_last[0].transpose(2, 0, 1) for channels_last in maps)))
 
 
-def test_equals_the_chain_by_hand(tiny_bundle: Path, scans: list[Points]) -> None:
-    detector = Detector(tiny_bundle)
+def test_equals_the_chain_by_hand(tiny_bundle: Path, bundle_without_counts: Path, scans: list[Points]) -> None:
+    detectors = Detector(tiny_bundle), Detector(tiny_bundle, threads=3), Detector(bundle_without_counts)
     for points in scans:
-        detections = detector(points)
-        assert len(detections) > 3
-        assert same(detections, detect_by_hand(tiny_bundle, points))
+        expected = detect_by_hand(tiny_bundle, points)
+        assert len(expected) > 3
+        assert all(same(detector(points), expected) for detector in detectors)
 
 
 def test_a_frame_inherits_nothing_from_the_one_before(tiny_bundle: Path, scans: list[Points]) -> None:
@@ -52,15 +53,6 @@ def test_a_frame_inherits_nothing_from_the_one_before(tiny_bundle: Path, scans: 
     assert same(detector(scans[0]), first)
 
 
-def test_stream_yields_in_order(tiny_bundle: Path, scans: list[Points]) -> None:
-    detector = Detector(tiny_bundle)
-    streamed = []
-    for points, detections in zip(scans, detector.stream(iter(scans)), strict=True):
-        assert detections.report.counts.points == len(points)
-        streamed.append(detections)
-    assert all(same(a, Detector(tiny_bundle)(p)) for a, p in zip(streamed, scans, strict=True))
-
-
 @pytest.mark.parametrize("points", [np.empty((0, 4), np.float32), np.full((50, 4), 500.0, np.float32)])
 def test_no_point_on_the_grid(bundle_without_counts: Path, points: Points) -> None:
     detector = Detector(bundle_without_counts)  # its encoder cannot run without a point
@@ -70,49 +62,30 @@ def test_no_point_on_the_grid(bundle_without_counts: Path, points: Points) -> No
     assert detections.report.counts == PillarCounts(len(points), len(points), 0, 0, 0)
 
 
-def test_one_point(tiny_bundle: Path) -> None:
-    detector = Detector(tiny_bundle, score_threshold=0.0)
-    point = np.array([[5.0, 0.3, -1.0, 0.5]], np.float32)
-    detections = detector(point)
-    assert same(detections, Detector(tiny_bundle, score_threshold=0.0)(point))
-    assert detections.report.counts == PillarCounts(1, 0, 0, 1, 0)
-
-
 def test_two_million_points(tiny_bundle: Path, scan: Points) -> None:
     detector = Detector(tiny_bundle)
-    mostly_far = np.concatenate([scan, np.full((2_000_000 - len(scan), 4), [900, 900, 900, 0.5], np.float32)])
-    detections = detector(mostly_far)
-    assert same(detections, detect_by_hand(tiny_bundle, mostly_far))
-    assert detections.report.counts.points_outside == 2_000_000 - len(scan)
-
-    crowded = np.tile(scan, (2000, 1))
+    far = np.full((1_000_000, 4), [900, 900, 900, 0.5], np.float32)
+    crowded = np.concatenate([np.tile(scan, (1000, 1)), far])
     detections = detector(crowded)
     assert same(detections, detect_by_hand(tiny_bundle, crowded))
-    counts = detections.report.counts
-    limits = load_pillar_bundle(tiny_bundle).spec.limits
-    assert counts.points == 2_000_000
-    kept = counts.points - counts.points_outside - counts.points_over_limit
-    assert 0 < kept <= limits.max_pillars * limits.max_points
+    counts, limits = detections.report.counts, load_pillar_bundle(tiny_bundle).spec.limits
+    assert isinstance(counts, PillarCounts) and counts.points == 2_000_000
+    assert counts.points_outside == len(far) + 1000 * detector(scan).report.counts.points_outside
+    assert (
+        0 < counts.points - counts.points_outside - counts.points_over_limit <= limits.max_pillars * limits.max_points
+    )
 
 
 def test_non_finite_points_are_dropped_and_counted(tiny_bundle: Path, scan: Points) -> None:
-    bad = np.full((4, 4), 5.0, np.float32)
-    bad[[0, 1, 2, 3], [0, 1, 2, 3]] = [np.nan, np.inf, -np.inf, np.nan]
+    bad = np.full((5, 4), 5.0)
+    bad[[0, 1, 2, 3, 4], [0, 1, 2, 3, 0]] = [np.nan, np.inf, -np.inf, np.nan, 1e300]  # the last one in float32
     detector = Detector(tiny_bundle)
-    clean = detector(scan)
-    assert clean.report.non_finite_points == 0
-    repaired = detector(np.concatenate([bad[:2], scan, bad[2:]]))
+    clean, repaired = detector(scan), detector(np.concatenate([bad[:2], scan, bad[2:]]))
     assert same(repaired, clean)
-    assert repaired.report.non_finite_points == 4
-    assert "4 points are not finite and were dropped" in repaired.report.warnings
+    assert (clean.report.non_finite_points, repaired.report.non_finite_points) == (0, 5)
+    assert "5 points are not finite and were dropped" in repaired.report.warnings
     assert not any("not finite" in text for text in clean.report.warnings)
     assert repaired.report.counts.points == len(scan)
-
-
-def test_a_value_beyond_float32_counts_as_non_finite(tiny_bundle: Path) -> None:
-    detector = Detector(tiny_bundle)
-    detections = detector(np.array([[1e300, 0.0, 0.0, 0.5], [5.0, 0.0, -1.0, 0.5]]))
-    assert detections.report.non_finite_points == 1
 
 
 def test_any_real_array_will_do_and_is_not_changed(tiny_bundle: Path, scan: Points) -> None:
@@ -131,14 +104,11 @@ def test_any_real_array_will_do_and_is_not_changed(tiny_bundle: Path, scan: Poin
         (np.zeros((5, 3)), r"shape \(5, 3\), not \(N, 4\).*append a column of reflectances"),
         (np.zeros((5, 5)), r"shape \(5, 5\), not \(N, 4\)"),
         (np.zeros((4, 9)), r"shape \(4, 9\), .*transpose it: points\.T"),
-        (np.zeros(4), r"shape \(4,\)"),
         (np.zeros((1, 5, 4)), r"shape \(1, 5, 4\)"),
         (np.array([["a"] * 4]), "not an array of numbers"),
-        (None, "shape|not an array of numbers"),
         ([[10**400, 0, 0, 0]], "not an array of numbers"),
         ([[1, 2, 3, 4], [1, 2]], "not an array of numbers"),
         (np.zeros((5, 4), complex), "not an array of numbers, but of type complex128"),
-        (np.zeros((5, 4), "M8[s]"), "not an array of numbers"),
         (np.ma.masked_equal(np.zeros((5, 4)), 0), "masked array"),
         (np.zeros(3, [("x", "f4"), ("y", "f4")]), "not an array of numbers"),
     ],
@@ -165,17 +135,13 @@ def test_score_threshold_overrides_every_class(tiny_bundle: Path, scan: Points) 
         ({"mounting": {"axes": "x-forward"}}, r"mounting {'axes': .*: give Mounting"),
         ({"threads": 2.0}, "threads 2.0 must lie between 1 and"),
         ({"threads": 0}, "threads 0 must lie between 1 and"),
-        ({"threads": 100_000}, "threads 100000 must lie between 1 and"),
         ({"threads": 99_999_999_999}, "threads 99999999999 must lie"),
+        ({"view": "behind"}, "view behind: give ahead or around"),
     ],
 )
 def test_options_out_of_range_are_refused(tiny_bundle: Path, options: dict[str, Any], name: str) -> None:
     with pytest.raises(ConfigError, match=name):
         Detector(tiny_bundle, **options)
-
-
-def test_the_number_of_threads_does_not_change_the_boxes(tiny_bundle: Path, scan: Points) -> None:
-    assert same(Detector(tiny_bundle, threads=1)(scan), Detector(tiny_bundle, threads=3)(scan))
 
 
 def test_report(tiny_bundle: Path, scan: Points) -> None:
@@ -205,11 +171,12 @@ def test_odd_scans_are_reported_each_time_and_logged_once(
     assert "divide it by 255" in caplog.text
 
 
-@pytest.mark.parametrize("reflectance", [1.02, 255.0, 65535.0, 1e10, 3e38, -1e6, -0.01])
+@pytest.mark.parametrize("reflectance", [1.02, 255.0, 3e38, -1e6, -0.01])
+@pytest.mark.parametrize("axes", ["x-forward", "y-forward"])
 def test_reflectances_outside_the_unit_range_are_clipped_and_counted(
-    tiny_bundle: Path, scan: Points, reflectance: float
+    tiny_bundle: Path, scan: Points, reflectance: float, axes: str
 ) -> None:
-    detector = Detector(tiny_bundle)
+    detector = Detector(tiny_bundle, mounting=Mounting(axes=axes))
     odd, clipped = scan.copy(), scan.copy()
     odd[5, 3], clipped[5, 3] = reflectance, np.clip(reflectance, 0, 1)
     detections = detector(odd)
@@ -219,13 +186,13 @@ def test_reflectances_outside_the_unit_range_are_clipped_and_counted(
     assert odd[5, 3] == np.float32(reflectance)  # the caller's array stays as it is
 
 
-@pytest.mark.parametrize("far", [1e5, 1e20, 3e38, -3e38])
+@pytest.mark.parametrize("far", [1e5, 3e38, -3e38])
 def test_absurd_coordinates_are_outside(tiny_bundle: Path, far: float) -> None:
     detector, scan = Detector(tiny_bundle), make_scan(0, 150)  # within the limits: no subset is drawn
     odd = np.concatenate([scan, np.array([[far, far, 0, 0.5], [5, 0, far, 0.5]], np.float32)])
-    detections = detector(odd)
-    assert same(detections, detector(scan))
-    assert detections.report.counts.points_outside == detector(scan).report.counts.points_outside + 2
+    detections, expected = detector(odd), detector(scan)
+    assert same(detections, expected)
+    assert detections.report.counts.points_outside == expected.report.counts.points_outside + 2
 
 
 def test_what_is_not_finite_in_the_networks_answer_is_left_out_and_counted(
@@ -271,10 +238,6 @@ def test_the_points_are_remembered_as_long_as_the_caller_keeps_them(tiny_bundle:
     del points
     assert detections._repr_png_() is None and "<img" not in detections._repr_html_()
     assert detections.plot().shape[2] == 3 and not np.array_equal(detections.plot(), with_points)
-
-
-def test_only_declared_inputs_are_fed(tiny_bundle: Path, bundle_without_counts: Path, scan: Points) -> None:
-    assert same(Detector(bundle_without_counts)(scan), Detector(tiny_bundle)(scan))
 
 
 def test_without_a_bundle_the_shipped_one_is_meant(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from asca_deploy import Detections, Detector, sample_scan_path
 from asca_deploy.around import about_ground, turns_around
-from asca_pillars.base.errors import ConfigError
 from asca_pillars.geometry.boxes import wrap_angle
 from asca_pillars.geometry.frame_change import FrameChange
 from asca_pillars.ops.pillar.grid import PillarGrid
@@ -59,17 +58,9 @@ def test_another_height() -> None:
     np.testing.assert_allclose(found.boxes[:, 2] - expected.boxes[:, 2], trained_m, atol=0.05)
 
 
-def test_a_reflectance_outside_is_clipped_in_any_frame(tiny_bundle: Path, scan: Points) -> None:
-    scan[7, 3] = 1.2
-    assert Detector(tiny_bundle, mounting=Mounting(axes="y-forward"))(scan).report.clipped_reflectances == 1
-
-
-@pytest.mark.parametrize("tilt_deg", [0.5, 3.0])
-def test_what_a_tilted_frame_leads_out_of_float32_is_dropped_and_counted(
-    tiny_bundle: Path, scan: Points, tilt_deg: float
-) -> None:
+def test_what_a_tilted_frame_leads_out_of_float32_is_dropped_and_counted(tiny_bundle: Path, scan: Points) -> None:
     """A driver's "no return" may be the largest number there is."""
-    pose, tilt = np.eye(4), np.radians(tilt_deg)
+    pose, tilt = np.eye(4), np.radians(3)
     pose[:3, :3] = [[np.cos(tilt), 0, np.sin(tilt)], [0, 1, 0], [-np.sin(tilt), 0, np.cos(tilt)]]
     detector = Detector(tiny_bundle, mounting=Mounting(pose=pose))  # type: ignore[arg-type]
     scan[::50, :3] = np.finfo(np.float32).max
@@ -149,11 +140,6 @@ def test_streams_and_threads_find_the_same_around(tiny_bundle: Path, scans: list
         assert all(map(same, pool.map(detector, scans * 4), alone * 4))
 
 
-def test_an_unknown_view(tiny_bundle: Path) -> None:
-    with pytest.raises(ConfigError, match="view behind: give ahead or around"):
-        Detector(tiny_bundle, view="behind")  # type: ignore[arg-type]
-
-
 def _rest(found: Detections) -> tuple:
     return found.scores, found.labels, found.class_names
 
@@ -176,11 +162,11 @@ def test_weights_of_whole_revolutions_look_around_in_one_pass(tmp_path: Path, re
 
 
 def test_views_of_a_camera_dense_necks_and_pillars_of_several_sizes_are_turned(tmp_path: Path) -> None:
-    def passes(folder: Path) -> int:
-        return Detector(folder, view="around").passes
-
     even = replace(SPEC, grid=replace(SPEC.grid, x_range_m=(0.0, 8.96), v_max_m=0.16, zones=1))
     seen = replace(EXPECTED_INPUT, camera_view=True)
-    assert passes(write_bundle(tmp_path / "camera", active_cells="sub", spec=even, expected_input=seen)) > 1
-    assert passes(write_bundle(tmp_path / "zones", active_cells="sub")) > 1
-    assert passes(write_bundle(tmp_path / "dense")) > 1
+    bundles = (
+        write_bundle(tmp_path / "camera", active_cells="sub", spec=even, expected_input=seen),
+        write_bundle(tmp_path / "zones", active_cells="sub"),
+        write_bundle(tmp_path / "dense"),
+    )
+    assert all(Detector(bundle, view="around").passes > 1 for bundle in bundles)

@@ -5,15 +5,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from asca_deploy import Detector
 from asca_deploy.golden import write_golden
 from asca_deploy.manifest import load_pillar_bundle
 from asca_pillars.base.errors import ConfigError, OutputError
-from asca_pillars.cli.main import app
 from asca_pillars.scans.scan_reader import write_scan
 from tests.deploy import conftest as tiny
+from tests.helpers.in_process import invoke
 
 
 @pytest.fixture
@@ -52,11 +51,8 @@ def test_each_stage_follows_from_the_one_before(tiny_bundle: Path, scan_path: Pa
 
 
 def test_the_manifest_says_which_bundle_and_scan(tiny_bundle: Path, scan_path: Path, tmp_path: Path) -> None:
-    result = CliRunner().invoke(
-        app, ["export", str(tiny_bundle), "--golden", "-o", str(tmp_path / "golden"), "--scans", str(scan_path.parent)]
-    )
-    assert result.exit_code == 0, result.output
-    assert "boxes of a.bin" in " ".join(result.output.split())
+    output = invoke("export", tiny_bundle, "--golden", "-o", tmp_path / "golden", "--scans", scan_path.parent)
+    assert "boxes of a.bin" in " ".join(output.split())
     contents = json.loads((tmp_path / "golden" / "golden.json").read_text())
     assert (contents["bundle"], contents["scan"], contents["precision"]) == ("tiny", "a.bin", "float32")
     assert contents["graphs"] == {name: graph.sha256 for name, graph in load_pillar_bundle(tiny_bundle).graphs.items()}
@@ -86,12 +82,12 @@ def test_written_again_and_only_over_itself(tiny_bundle: Path, scan_path: Path, 
     ("options", "message"),
     [
         (["--golden", "--int8"], "--int8 is for a checkpoint"),
+        (["--golden", "--with-weights"], "--with-weights is for a checkpoint"),
         (["--golden", "--score", "Car=0.3"], "--score is for a checkpoint"),
         (["--golden", "--browser"], "one of --golden and --browser"),
         (["--ort-web", "x.tgz"], "--ort-web goes with --browser"),
     ],
 )
 def test_options_that_do_not_go_together(tiny_bundle: Path, tmp_path: Path, options: list[str], message: str) -> None:
-    result = CliRunner().invoke(app, ["export", str(tiny_bundle), "-o", str(tmp_path / "out"), *options])
-    assert isinstance(result.exception, ConfigError)
-    assert message in str(result.exception)
+    with pytest.raises(ConfigError, match=message):
+        invoke("export", tiny_bundle, "-o", tmp_path / "out", *options)

@@ -25,19 +25,19 @@ def rename(model: onnx.ModelProto, old: str, new: str) -> None:
 
 
 @by_provider
-def test_unknown_input(bundle_copy: Path, provider: Provider) -> None:
-    corrupt_graph(bundle_copy, "backbone.onnx", lambda model: rename(model, "canvas", "image"))
-    with pytest.raises(BundleError, match=r"backbone\.onnx has an unknown input `image`, the runtime knows canvas"):
-        Detector(bundle_copy, provider=provider)
-    corrupt_graph(bundle_copy, "encoder.onnx", lambda model: rename(model, "pillar_index", "pillar_of_point"))
-    with pytest.raises(BundleError, match=r"encoder\.onnx has an unknown input `pillar_of_point`"):
-        Detector(bundle_copy, provider=provider)
-
-
-@by_provider
-def test_missing_output(bundle_copy: Path, provider: Provider) -> None:
-    corrupt_graph(bundle_copy, "backbone.onnx", lambda model: rename(model, "directions", "yaw_bins"))
-    with pytest.raises(BundleError, match=r"backbone\.onnx has no output `directions`, only .*yaw_bins"):
+@pytest.mark.parametrize(
+    ("graph", "old", "new", "message"),
+    [
+        ("backbone", "canvas", "image", "has an unknown input `image`, the runtime knows canvas"),
+        ("encoder", "pillar_index", "pillar_of_point", "has an unknown input `pillar_of_point`"),
+        ("backbone", "directions", "yaw_bins", "has no output `directions`, only .*yaw_bins"),
+    ],
+)
+def test_inputs_and_outputs_of_other_names(
+    bundle_copy: Path, provider: Provider, graph: str, old: str, new: str, message: str
+) -> None:
+    corrupt_graph(bundle_copy, f"{graph}.onnx", lambda model: rename(model, old, new))
+    with pytest.raises(BundleError, match=rf"{graph}\.onnx {message}"):
         Detector(bundle_copy, provider=provider)
 
 

@@ -8,15 +8,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+pytest.importorskip("rosbags", reason="needs pip install -e '.[recordings]'")
+
 from asca_deploy import Detector, sample_scan_path
 from asca_deploy.inspect_scans import inspect_scans
-from asca_pillars.base.errors import AscaError, ConfigError, PartialError, ScanError
-from asca_pillars.cli.inspect import inspect
+from asca_pillars.base.errors import AscaError, ScanError
 from asca_pillars.scans.mounting import Mounting
 from asca_pillars.scans.scan_reader import read_scan, write_scan
 from asca_pillars.scans.scan_settings import ScanSettings
 from tests.helpers.in_process import invoke, run_here
 from tests.helpers.scenes import write_dataset
+from tests.scans.recordings.cloud_recordings import clouds, laid_out, stamps, write_mcap
 
 POINTS = read_scan(sample_scan_path()).points[::4].copy()
 TURNED = np.column_stack([-POINTS[:, 1], POINTS[:, 0], POINTS[:, 2], POINTS[:, 3]])
@@ -64,7 +66,7 @@ def test_files_are_measured(folder: Path) -> None:
 
 def test_some_of_many_files_are_read(tmp_path: Path) -> None:
     for number in range(10):
-        np.save(tmp_path / f"{number}.npy", POINTS)
+        np.save(tmp_path / f"{number}.npy", POINTS[::10])
     (tmp_path / "1.npy").write_bytes(b"never read")
     steps: list[tuple[int, int]] = []
     found = inspect_scans(tmp_path, frames=3, progress=lambda _, done, total: steps.append((done, total)))
@@ -105,29 +107,36 @@ def test_what_is_printed_and_written(folder: Path) -> None:
     assert "against fast" in output and output.endswith("Nothing to warn of.\n")
 
 
-def test_options_that_do_not_go_together(folder: Path) -> None:
-    dataset = write_dataset(folder / "kitti", 1)
-    with pytest.raises(ConfigError, match="kitti: is a dataset; give --config"):
-        inspect(dataset)
-    for options in ({"axes": "y-forward"}, {"topic": "/lidar"}, {"around": True}, {"columns": 5}):
-        with pytest.raises(ConfigError, match=f"--{next(iter(options))}: is for scans without labels"):
-            inspect(dataset, config=Path("asca_small_sim"), **options)  # type: ignore[arg-type]
-    for name, value in (("split", "val"), ("propose", Path("own.yaml")), ("draw", 2), ("out", Path("pictures"))):
-        with pytest.raises(ConfigError, match=f"--{name} .*: is for a dataset with labels; give --config"):
-            inspect(folder, **{name: value})  # type: ignore[arg-type]
-    with pytest.raises(ConfigError, match="--topic /lidar: is for recordings"):
-        inspect(folder, topic="/lidar")
-
-
-# --- recordings
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ("{kitti}", "kitti: is a dataset; give --config"),
+        *(
+            (f"{{kitti}} -c asca_small_sim {option}", f"{option.split()[0]}: is for scans without labels")
+            for option in ("--axes y-forward", "--topic /lidar", "--around", "--columns 5")
+        ),
+        *(
+            (f"{{scans}} {option}", f"{option}: is for a dataset with labels; give --config")
+            for option in ("--split val", "--propose own.yaml", "--draw 2", "--out pictures")
+        ),
+        ("{scans}/0.npy --topic /lidar", "--topic /lidar: is for recordings"),
+        ("{odd}", "several topics hold scans, give --topic: /lidar"),
+        ("{odd} --topic /imu", "/imu holds sensor_msgs/msg/Imu, not scans"),
+        ("{odd} --topic /lidar --columns 5", "--columns 5: is for .bin files"),
+        ("{odd} --config asca_small_sim", "is a recording, and --config asca_small_sim for datasets"),
+        ("{odd} --topic /lidar --bundle nowhere", "nowhere"),
+    ],
+)
+def test_what_does_not_go_together_is_one_line(folder: Path, odd: Path, options: str, message: str) -> None:
+    kitti = write_dataset(folder / "kitti", 1)
+    with pytest.raises(AscaError) as error:
+        invoke("inspect", *options.format(kitti=kitti, scans=folder, odd=odd).split())
+    assert message in str(error.value) and "\n" not in str(error.value)
 
 
 @pytest.fixture
 def odd(tmp_path: Path) -> Path:
     """Nine scans at 10 Hz, of which the fifth and sixth are missing, and a message that cannot be read."""
-    pytest.importorskip("rosbags", reason="needs pip install -e '.[recordings]'")
-    from tests.scans.recordings.cloud_recordings import clouds, laid_out, stamps, write_mcap
-
     times = [stamps(9)[number] for number in (0, 1, 2, 3, 6, 7, 8)]
     bytewise = POINTS * np.array([1, 1, 1, 255], np.float32)
     messages = [(time_ns, laid_out(bytewise, time_ns=time_ns)) for time_ns in times]
@@ -155,13 +164,11 @@ def test_a_recording_is_described(odd: Path) -> None:
 
 
 def test_a_recording_in_the_terminal(odd: Path) -> None:
-    with pytest.raises(PartialError, match="message 2"):
-        inspect(odd, topic="/lidar", json=odd.parent / "report.json")
+    done = run_here("inspect", odd, "--topic", "/lidar", "--json", odd.parent / "report.json")
+    assert done.returncode == 3 and "message 2" in done.stderr and "sensor_msgs/msg/Imu" in done.stdout
+    assert "0.8 s, 10 scans per second; frame lidar; fields x, y, z, intensity" in done.stdout
     report = json.loads((odd.parent / "report.json").read_text())
     assert report["times"]["missing"] == 2 and report["topics"][0]["type"] == "sensor_msgs/msg/Imu"
-    done = run_here("inspect", odd, "--topic", "/lidar")
-    assert done.returncode == 3 and "sensor_msgs/msg/Imu" in done.stdout
-    assert "0.8 s, 10 scans per second; frame lidar; fields x, y, z, intensity" in done.stdout
 
 
 def test_a_packed_recording_says_so(odd: Path) -> None:
@@ -171,35 +178,7 @@ def test_a_packed_recording_says_so(odd: Path) -> None:
     assert f"{packed}: unpacked to " in output and f"warning: {packed}" not in output
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({}, "several topics hold scans, give --topic: /lidar"),
-        ({"topic": "/imu"}, "/imu holds sensor_msgs/msg/Imu, not scans"),
-        ({"topic": "/lidar", "columns": 5}, "--columns 5: is for .bin files"),
-        ({"config": Path("asca_small_sim")}, "is a recording, and --config asca_small_sim for datasets"),
-        ({"topic": "/lidar", "bundle": Path("nowhere")}, "nowhere"),
-    ],
-)
-def test_recordings_are_refused_in_one_line(odd: Path, options: dict[str, object], message: str) -> None:
-    with pytest.raises(AscaError, match=message) as error:
-        inspect(odd, **options)  # type: ignore[arg-type]
-    assert "\n" not in str(error.value)
-
-
-def test_no_scan_can_be_read(tmp_path: Path) -> None:
-    pytest.importorskip("rosbags", reason="needs pip install -e '.[recordings]'")
-    from tests.scans.recordings.cloud_recordings import stamps, write_mcap
-
-    path = write_mcap(tmp_path / "torn.mcap", {"/lidar": [(time_ns, b"torn") for time_ns in stamps(2)]})
-    with pytest.raises(ScanError, match=r"none of the 2 scans of /lidar can be read: .*message 0"):
-        inspect_scans(path)
-
-
 def test_frames_and_stamps_that_change(tmp_path: Path) -> None:
-    pytest.importorskip("rosbags", reason="needs pip install -e '.[recordings]'")
-    from tests.scans.recordings.cloud_recordings import laid_out, stamps, write_mcap
-
     messages = [(time_ns, laid_out(POINTS, time_ns=time_ns)) for time_ns in stamps(4)]
     messages[1][1].header = replace(messages[1][1].header, frame_id="other")
     messages[3] = messages[3][0], laid_out(POINTS, time_ns=stamps(4)[0])

@@ -2,8 +2,9 @@
 
 import contextlib
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import TypeAlias
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from asca_pillars.base.errors import ConfigError, ScanError
 from tests.deploy.conftest import make_scan
 
 PATIENCE_S = 20
+Start: TypeAlias = Callable[[Callable[[], object]], threading.Thread]
 
 
 def scan(number: int) -> np.ndarray:
@@ -25,9 +27,16 @@ def numbers(queue: ScanQueue) -> list[int]:
 
 
 @pytest.fixture
-def started() -> Iterator[list[threading.Thread]]:
+def start() -> Iterator[Start]:
+    """Starts a thread that has to end before the test does."""
     threads: list[threading.Thread] = []
-    yield threads
+
+    def begin(target: Callable[[], object]) -> threading.Thread:
+        threads.append(threading.Thread(target=target))
+        threads[-1].start()
+        return threads[-1]
+
+    yield begin
     for thread in threads:
         thread.join(PATIENCE_S)
         assert not thread.is_alive()
@@ -43,7 +52,7 @@ def test_the_oldest_waiting_scan_is_dropped_and_counted() -> None:
     assert [queue.next_tag(), queue.next_tag()] == [30, 40]
 
 
-def test_waiting_loses_nothing_and_holds_the_sensor_back(started: list[threading.Thread]) -> None:
+def test_waiting_loses_nothing_and_holds_the_sensor_back(start: Start) -> None:
     queue = ScanQueue("wait")
     in_queue: list[int] = []
 
@@ -53,27 +62,25 @@ def test_waiting_loses_nothing_and_holds_the_sensor_back(started: list[threading
             in_queue.append(number)
         queue.close()
 
-    started.append(threading.Thread(target=sensor))
-    started[0].start()
+    start(sensor)
     for position, points in enumerate(queue):
         assert int(points[0, 0]) == position
         assert len(in_queue) <= position + 2
     assert (queue.dropped, queue.taken) == (0, 20)
 
 
-def test_closing_lets_a_waiting_sensor_go(started: list[threading.Thread]) -> None:
+def test_closing_lets_a_waiting_sensor_go(start: Start) -> None:
     queue = ScanQueue("wait")
     queue.put(scan(0))
     answers: list[bool] = []
-    started.append(threading.Thread(target=lambda: answers.append(queue.put(scan(1)))))
-    started[0].start()
+    waiting = start(lambda: answers.append(queue.put(scan(1))))
     queue.close()
-    started[0].join(PATIENCE_S)
+    waiting.join(PATIENCE_S)
     assert answers == [False] and not queue.put(scan(2))
     assert numbers(queue) == [0]
 
 
-def test_a_stream_that_is_slower_than_the_sensor(tiny_bundle: Path, started: list[threading.Thread]) -> None:
+def test_a_stream_that_is_slower_than_the_sensor(tiny_bundle: Path, start: Start) -> None:
     queue, detector = ScanQueue("drop"), Detector(tiny_bundle)
     first = threading.Event()
 
@@ -85,8 +92,7 @@ def test_a_stream_that_is_slower_than_the_sensor(tiny_bundle: Path, started: lis
             queue.put(make_scan(number), tag=number)
         queue.close()
 
-    started.append(threading.Thread(target=sensor))
-    started[0].start()
+    start(sensor)
     tags = []
     for detections in detector.stream(queue):
         first.set()
@@ -124,9 +130,7 @@ def test_tags_keep_their_places_among_scans_without_and_those_leave_nothing_behi
 
 
 @pytest.mark.parametrize("way", ["left", "error"])
-def test_a_stream_over_a_silent_sensor_can_be_left(
-    tiny_bundle: Path, started: list[threading.Thread], way: str
-) -> None:
+def test_a_stream_over_a_silent_sensor_can_be_left(tiny_bundle: Path, start: Start, way: str) -> None:
     """The sensor stops without a word; leaving the loop does not wait for it, and a new stream goes on."""
     queue, detector = ScanQueue("wait", size=3), Detector(tiny_bundle)
     for number in range(2):
@@ -141,10 +145,8 @@ def test_a_stream_over_a_silent_sensor_can_be_left(
                 raise KeyboardInterrupt
         left.set()
 
-    thread = threading.Thread(target=drive)
-    thread.start()
+    start(drive)
     assert left.wait(PATIENCE_S)
-    started.append(thread)
     queue.put(make_scan(2), tag=2)
     queue.close()
     assert [queue.next_tag() for _ in detector.stream(queue)][-1] == 2

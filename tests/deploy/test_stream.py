@@ -28,13 +28,14 @@ def _no_thread_is_left() -> Iterator[None]:
 
 def test_the_same_boxes_and_counters_as_one_by_one(tiny_bundle: Path) -> None:
     scans = [make_scan(seed, count) for seed, count in enumerate((1000, 0, 200, 1, 1000, 900, 30))]
-    detector, alone = Detector(tiny_bundle), Detector(tiny_bundle)
+    detector, alone, other = Detector(tiny_bundle), Detector(tiny_bundle), make_scan(7)
     streamed = 0
     for points, detections in zip(scans, detector.stream(iter(scans)), strict=True):
         expected = alone(points)
         assert same(detections, expected)
         assert detections.report.counts == expected.report.counts
         assert detections.report.warnings == expected.report.warnings
+        assert same(detector(other), alone(other)), "a call between two scans of the stream disturbs neither"
         streamed += len(detections)
     assert streamed > 10
 
@@ -47,10 +48,6 @@ def test_latency_includes_the_waiting(tiny_bundle: Path, scans: list[Points]) ->
         assert frame.waiting_ms > 0
         assert frame.total_ms == pytest.approx(sum(frame.times_ms.values()) + frame.waiting_ms)
     assert detector(scans[0]).report.waiting_ms == 0
-
-
-def test_no_scans_no_detections(tiny_bundle: Path) -> None:
-    assert list(Detector(tiny_bundle).stream([])) == []
 
 
 def test_never_more_than_one_scan_ahead(tiny_bundle: Path) -> None:
@@ -82,28 +79,23 @@ def test_a_slow_source_does_not_hold_back_what_is_done(tiny_bundle: Path, scan: 
     assert len(list(results)) == 1
 
 
-def test_an_error_of_the_source_comes_in_its_place(tiny_bundle: Path, scan: Points) -> None:
+@pytest.mark.parametrize("cause", ["source", "shape"])
+def test_an_error_comes_in_its_place(tiny_bundle: Path, scan: Points, cause: str) -> None:
     def source() -> Iterator[Points]:
         yield from (scan, scan)
-        raise OSError("unplugged")
+        if cause == "source":
+            raise OSError("unplugged")
+        yield scan[:, :3]
+        yield scan
 
     detector = Detector(tiny_bundle)
     results = detector.stream(source())
     expected = detector(scan)
     assert same(next(results), expected) and same(next(results), expected)
-    with pytest.raises(OSError, match="unplugged"):
+    with pytest.raises(OSError if cause == "source" else ScanError, match=r"unplugged|not \(N, 4\)"):
         next(results)
-    assert list(results) == []
+    assert list(results) == [] == list(detector.stream([]))
     assert same(detector(scan), expected)
-
-
-def test_a_scan_of_the_wrong_shape_comes_in_its_place(tiny_bundle: Path, scan: Points) -> None:
-    detector = Detector(tiny_bundle)
-    results = detector.stream([scan, scan[:, :3], scan])
-    assert len(next(results)) > 0
-    with pytest.raises(ScanError, match="not \\(N, 4\\)"):
-        next(results)
-    assert len(list(detector.stream([scan, scan]))) == 2
 
 
 @pytest.mark.parametrize("stage", ["infer", "finish"])
@@ -138,14 +130,6 @@ def test_closing_early_ends_the_threads_and_spoils_nothing(tiny_bundle: Path, sc
     results.close()
     assert list(results) == []
     assert same(detector(scans[0]), expected)
-
-
-def test_a_call_between_two_scans_of_a_stream_disturbs_neither(tiny_bundle: Path, scans: list[Points]) -> None:
-    detector, alone = Detector(tiny_bundle), Detector(tiny_bundle)
-    other = make_scan(7)
-    for points, detections in zip(scans, detector.stream(scans), strict=True):
-        assert same(detections, alone(points))
-        assert same(detector(other), alone(other))
 
 
 def test_nothing_grows_with_the_number_of_scans(tiny_bundle: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -5,7 +5,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from asca_deploy.tracker import Tracker
+from asca_deploy import find_bundle
+from asca_deploy.manifest import load_bundle
+from asca_deploy.open_model import track_thresholds
+from asca_deploy.tracker import WEAK_SHARE, Tracker
 from asca_pillars.base.errors import ConfigError
 from asca_pillars.detection.detections import Detections
 
@@ -143,14 +146,10 @@ def test_time_that_goes_back_begins_another_drive_and_pauses_end_tracks() -> Non
     assert tracker(found((10, 0, 0.9, 0)), 9.0).track_ids.tolist() == [2], "the same moment again"
 
 
-def test_no_detections_at_all() -> None:
-    tracker = Tracker()
-    assert len(tracker(Detections.empty(NAMES), 0.0)) == 0
-    assert tracker(Detections.empty(NAMES), 1.0).to_dicts() == []
-
-
 def test_plain_values() -> None:
-    (record,) = Tracker()(found((10, 0, 0.9, 0)), 0.0).to_dicts()
+    tracker = Tracker()
+    assert tracker(Detections.empty(NAMES), 0.0).to_dicts() == []
+    (record,) = tracker(found((10, 0, 0.9, 0)), 1.0).to_dicts()
     assert record["class"] == "Car" and record["track_id"] == 0 and record["vx_mps"] == record["vy_mps"] == 0.0
 
 
@@ -162,12 +161,22 @@ def test_impossible_settings_are_refused(values: dict) -> None:
         Tracker(**values)
 
 
-@pytest.mark.parametrize("wrong", [np.eye(3), np.full((4, 4), np.nan)])
-def test_wrong_poses_and_times_are_refused(wrong: np.ndarray) -> None:
-    with pytest.raises(ConfigError, match="4x4"):
-        Tracker()(found(), 0.0, wrong)
+def test_wrong_poses_and_times_are_refused() -> None:
+    for wrong in (np.eye(3), np.full((4, 4), np.nan)):
+        with pytest.raises(ConfigError, match="4x4"):
+            Tracker()(found(), 0.0, wrong)
     for shifted in (pose(5).T, 1000 * pose(), np.diag([1, -1, 1, 1])):
         with pytest.raises(ConfigError, match="must be a rotation and a shift in metres"):
             Tracker()(found(), 0.0, shifted)
     with pytest.raises(ConfigError, match="time nan"):
         Tracker()(found(), float("nan"))
+
+
+def test_tracks_begin_at_the_thresholds_and_go_on_below_the_lowest() -> None:
+    own = {one.name: one.score_threshold for one in load_bundle(find_bundle(None)).spec.classes}
+    births, least = track_thresholds(None)
+    assert births == own and least == pytest.approx(WEAK_SHARE * min(own.values()))
+    births, least = track_thresholds(None, {"Car": 0.1})
+    assert births == own | {"Car": 0.1} and least == pytest.approx(WEAK_SHARE * 0.1)
+    with pytest.raises(ConfigError, match="Tram"):
+        track_thresholds(None, {"Tram": 0.5})

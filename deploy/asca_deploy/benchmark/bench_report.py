@@ -1,18 +1,21 @@
-"""Time per stage, and the hardware it was measured on; warm frames apart from the cold first one."""
+"""Time per stage, memory and the hardware; warm frames apart from the cold first one."""
 
 import hashlib
+import sys
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from asca_deploy.benchmark.resident_memory import peak_memory_mib
 from asca_deploy.benchmark.timing import Percentiles, Track, pillars_of, run_frame, silently
 from asca_deploy.detector import Detector
 from asca_pillars.base.system import cpu_model, package_versions
 from asca_pillars.detection.detections import FrameReport
+
+STATUS = Path("/proc/self/status")
 
 
 @dataclass(frozen=True)
@@ -136,3 +139,32 @@ def _sha256(scans: Sequence[NDArray[np.float32]]) -> str:
     for scan in scans:
         digest.update(np.ascontiguousarray(scan, "<f4").tobytes())
     return digest.hexdigest()
+
+
+def peak_memory_mib() -> float | None:
+    """Return the largest resident memory of the process so far; None if the system does not report it.
+
+    Linux keeps the figure of getrusage across exec, which is too large for a small program started by a large one;
+    /proc is correct.
+    """
+    if (peak := _status_mib("VmHWM")) is not None:
+        return peak
+    if sys.platform == "win32":
+        return None
+    import resource  # does not exist on Windows
+
+    largest = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return float(largest / 2**20 if sys.platform == "darwin" else largest / 2**10)  # bytes there, KiB elsewhere
+
+
+def resident_mib() -> float | None:
+    """Return the resident memory of the process now; None if the system does not report it."""
+    return _status_mib("VmRSS")
+
+
+def _status_mib(key: str) -> float | None:
+    try:
+        lines = STATUS.read_text().splitlines()
+    except OSError:
+        return None
+    return next((int(line.split()[1]) / 2**10 for line in lines if line.startswith(f"{key}:")), None)

@@ -33,7 +33,7 @@ print(json.dumps([imported, loaded - start, boxes - loaded, boxes]))
 
 _DETECT = """
 import sys
-from asca_deploy.benchmark.resident_memory import peak_memory_mib
+from asca_deploy.benchmark.bench_report import peak_memory_mib
 from asca_pillars.cli.main import app
 app(["detect", sys.argv[2], "--bundle", sys.argv[1], "--out", sys.argv[3], *sys.argv[4:]], standalone_mode=False)
 print(peak_memory_mib())

@@ -1,7 +1,10 @@
-"""Health of a node: counters and latencies, as a line of its log and as diagnostics."""
+"""Health of a node: counters and latencies, as a line of its log, as diagnostics, and as word to systemd."""
 
+import os
+import socket
 import threading
 from collections import Counter, deque
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from time import monotonic
 from typing import Any
@@ -103,3 +106,41 @@ class Health:
             if self.warnings:
                 return WARN, self.warnings[0]
             return OK, "every scan is answered"
+
+
+class Systemd:
+    """Notifications (sd_notify(3)) to the socket that systemd names in the environment; without one nothing is sent.
+
+    Attributes:
+        watchdog_s: seconds after which systemd restarts a service that did not say that it lives; None: it does not
+            watch.
+    """
+
+    def __init__(self, environment: Mapping[str, str] | None = None) -> None:
+        environment = os.environ if environment is None else environment
+        self._address = environment.get("NOTIFY_SOCKET", "")
+        microseconds, pid = environment.get("WATCHDOG_USEC", ""), environment.get("WATCHDOG_PID", "")
+        is_watched = self._address and microseconds.isdecimal() and pid in ("", str(os.getpid()))
+        self.watchdog_s = int(microseconds) / 1e6 if is_watched and int(microseconds) else None
+
+    def ready(self, status: str) -> None:
+        """Notify that the service is ready; `status` is what `systemctl status` shows."""
+        self._send("READY=1", f"STATUS={status}")
+
+    def alive(self, status: str) -> None:
+        """Notify that the service is alive."""
+        self._send("WATCHDOG=1", f"STATUS={status}")
+
+    def stopping(self) -> None:
+        """Notify that the service is stopping."""
+        self._send("STOPPING=1")
+
+    def _send(self, *lines: str) -> None:
+        if not self._address:
+            return
+        address = f"\0{self._address[1:]}" if self._address.startswith("@") else self._address
+        try:
+            with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC) as sender:
+                sender.sendto("\n".join(lines).encode(), address)
+        except OSError:  # nobody listens any more: the service goes on
+            pass

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_deploy.detector import Detector
+from asca_deploy.ros2.health import Systemd
 from asca_deploy.ros2.live import LiveDetection
 from asca_deploy.ros2.messages import (
     Stamp,
@@ -23,7 +24,6 @@ from asca_deploy.ros2.messages import (
     marker_array,
     message_type,
 )
-from asca_deploy.ros2.systemd import Systemd
 from asca_deploy.scan_detections import ScanDetections
 from asca_deploy.tracker import Tracker
 from asca_deploy.tracks import Tracks

@@ -1,5 +1,7 @@
-"""Clouds in, boxes out, without ROS: in order, with their stamps, the oldest dropped."""
+"""Clouds in, boxes out, without ROS: in order, with their stamps, the oldest dropped; and what systemd is told."""
 
+import os
+import socket
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -11,6 +13,7 @@ import pytest
 from numpy.typing import NDArray
 
 from asca_deploy import Detections, Detector
+from asca_deploy.ros2.health import Systemd
 from asca_deploy.ros2.live import LiveDetection
 from asca_deploy.ros2.messages import ERROR, OK, WARN, Stamp
 from asca_deploy.ros2.node import NodeSettings, reliability
@@ -42,7 +45,8 @@ class Running:
         self.answers: list[tuple[Stamp, Detections | Tracks]] = []
         self.events: list[dict[str, Any]] = []
         self.mountings: list[Mounting] = []
-        self.came = threading.Semaphore(0)
+        self.came, self.entered, self.free = threading.Semaphore(0), threading.Event(), threading.Event()
+        self.free.set()
         self.live = LiveDetection(
             self._open(bundle),
             reading or ScanSettings(),
@@ -58,6 +62,8 @@ class Running:
         return lambda mounting: self.mountings.append(mounting) or Detector(bundle, threads=1, mounting=mounting)
 
     def _answer(self, stamp: Stamp, found: Detections | Tracks) -> None:
+        self.entered.set()
+        self.free.wait(20)
         self.answers.append((stamp, found))
         self.came.release()
 
@@ -99,8 +105,8 @@ def test_no_points_not_numbers_and_other_fields(tiny_bundle: Path, scan: NDArray
     broken = scan.copy()
     broken[::2, 1] = np.nan
     running.ask(cloud(broken))
-    running.live.enqueue(cloud(scan, names=("u", "v", "w", "intensity")))
-    running.live.enqueue(cloud(scan, names=("u", "v", "w", "intensity")))
+    for _ in range(2):
+        running.live.enqueue(cloud(scan, names=("u", "v", "w", "intensity")))
     running.ask(cloud(scan[:, :3], names=("x", "y", "z")))
     running.end()
     health = running.live.health
@@ -111,24 +117,17 @@ def test_no_points_not_numbers_and_other_fields(tiny_bundle: Path, scan: NDArray
 
 def test_the_oldest_scan_gives_way(tiny_bundle: Path, scan: NDArray[np.float32]) -> None:
     running = Running(tiny_bundle)
-    hold, entered = threading.Event(), threading.Event()
-
-    def held(stamp: Stamp, found: Detections | Tracks) -> None:
-        entered.set()
-        hold.wait(20)
-        running.answers.append((stamp, found))
-
-    running.live._answer = held
+    running.free.clear()
     running.live.enqueue(cloud(scan, 0))
-    assert entered.wait(20)
+    assert running.entered.wait(20)
     for sec in range(1, 11):
         running.live.enqueue(cloud(scan, sec))
     assert running.live.busy_s() > 0
     dropped = running.live.health.dropped
     assert dropped >= 6
-    hold.set()
-    while len(running.answers) < 11 - dropped:
-        assert running.thread.is_alive()
+    running.free.set()
+    for _ in range(11 - dropped):
+        assert running.came.acquire(timeout=20)
     running.end()
     seconds = [stamp.sec for stamp, _ in running.answers]
     assert seconds[0] == 0 and seconds[-1] == 10 and seconds == sorted(seconds)
@@ -252,3 +251,33 @@ def test_reliability_follows_the_publishers(offered: list[str], qos: Any, chosen
 def test_wrong_settings_are_refused(wrong: dict[str, Any]) -> None:
     with pytest.raises(ConfigError):
         NodeSettings(topic="/points", reading=ScanSettings(), **wrong)
+
+
+@pytest.mark.parametrize("is_abstract", [False, True])
+def test_messages_arrive_on_the_socket(tmp_path: Path, is_abstract: bool) -> None:
+    name = f"asca-{os.getpid()}" if is_abstract else str(tmp_path / "notify")
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as listener:
+        listener.bind(f"\0{name}" if is_abstract else name)
+        environment = {"NOTIFY_SOCKET": f"@{name}" if is_abstract else name, "WATCHDOG_USEC": "3000000"}
+        systemd = Systemd(environment)
+        systemd.ready("warmed up")
+        systemd.alive("5 scans")
+        systemd.stopping()
+        heard = [listener.recv(1000).decode().splitlines() for _ in range(3)]
+    assert heard == [["READY=1", "STATUS=warmed up"], ["WATCHDOG=1", "STATUS=5 scans"], ["STOPPING=1"]]
+    assert systemd.watchdog_s == 3.0
+
+
+@pytest.mark.parametrize(
+    "environment",
+    [
+        {},
+        {"NOTIFY_SOCKET": "/nobody", "WATCHDOG_USEC": "1000000", "WATCHDOG_PID": "1"},  # of another process
+        {"NOTIFY_SOCKET": "/nobody", "WATCHDOG_USEC": "0"},
+        {"NOTIFY_SOCKET": "/nobody", "WATCHDOG_USEC": "soon"},
+    ],
+)
+def test_where_nobody_watches_nothing_is_told(environment: dict[str, str]) -> None:
+    systemd = Systemd(environment)
+    systemd.ready("well")
+    assert systemd.watchdog_s is None
