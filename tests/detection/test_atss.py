@@ -6,13 +6,12 @@ import statistics
 import numpy as np
 import pytest
 from hypothesis import assume, given, settings
-from hypothesis import strategies as st
 
 from asca_pillars.detection.anchors import IGNORED, KITTI_CLASSES, make_anchors
 from asca_pillars.detection.targets import Targets, assign_targets
 from asca_pillars.geometry.boxes import decode_boxes, wrap_angle
 from asca_pillars.geometry.overlap import aligned_bev_iou
-from tests.detection.anchor_scenes import ANCHORS, CAR, COUNT, CYCLIST, PEDESTRIAN, labelled_boxes, places
+from tests.detection.anchor_scenes import ANCHORS, CAR, COUNT, CYCLIST, labelled_boxes, places
 
 # Cells of 1 m with centers at 0, 1, ..., 8 m.
 SQUARE = make_anchors(np.arange(9.0), np.arange(9.0), KITTI_CLASSES)
@@ -71,7 +70,7 @@ def assign_twin(boxes: np.ndarray, labels: np.ndarray) -> tuple[list[int], dict[
     return states, matches
 
 
-@settings(max_examples=40)
+@settings(max_examples=100)
 @given(labelled_boxes())
 def test_equals_loops_over_all_anchors(labelled: tuple[np.ndarray, np.ndarray]) -> None:
     boxes, labels = labelled
@@ -86,37 +85,6 @@ def test_equals_loops_over_all_anchors(labelled: tuple[np.ndarray, np.ndarray]) 
     np.testing.assert_allclose(wrap_angle(decoded[:, 6] - boxes[targets.matched, 6]), 0, atol=2e-6)
 
 
-@settings(max_examples=60)
-@given(
-    st.sampled_from([CAR, PEDESTRIAN, CYCLIST]), st.floats(2.2, 9.5), st.floats(-1.7, 3.0), st.floats(-math.pi, 3.14)
-)
-def test_an_object_on_the_grid_is_found_by_its_best_anchor(label: int, x: float, y: float, yaw: float) -> None:
-    spec = KITTI_CLASSES[label]
-    box = [x, y, -0.9, spec.length_m, spec.width_m, spec.height_m, yaw]
-    targets = assign((label, box), anchors=ANCHORS)
-    own = ANCHORS[..., 2 * label : 2 * label + 2, :].reshape(-1, 7)
-    best = aligned_bev_iou(own, np.array([box], np.float32)).max()
-    assert aligned_bev_iou(targets.anchors, np.array([box], np.float32)).max() == best > 0
-    assert {anchor // 2 for _, _, anchor in places(targets, 1)} == {label}
-    assert len(targets.positives) <= 18 and not (targets.state == -1).any()
-
-
-@settings(max_examples=40)
-@given(labelled_boxes(), st.randoms())
-def test_the_order_of_the_boxes_does_not_matter(labelled: tuple[np.ndarray, np.ndarray], random) -> None:  # type: ignore[no-untyped-def]
-    boxes, labels = labelled
-    order = list(range(len(boxes)))
-    random.shuffle(order)
-    one = assign_targets(ANCHORS, KITTI_CLASSES, boxes, labels, "atss")
-    other = assign_targets(ANCHORS, KITTI_CLASSES, boxes[order], labels[order], "atss")
-    # Two boxes that are equally good for an anchor are told apart by their order alone.
-    iou = aligned_bev_iou(ANCHORS.reshape(-1, 7)[one.positives], boxes[labels != IGNORED])
-    ranked = np.sort(iou, axis=1)
-    assume(ranked.shape[1] < 2 or not ((ranked[:, -1] == ranked[:, -2]) & (ranked[:, -1] > 0)).any())
-    np.testing.assert_array_equal(one.state, other.state)
-    np.testing.assert_array_equal(one.matched, np.array(order, np.int64)[other.matched])
-
-
 @pytest.mark.parametrize(("length_m", "columns"), [(1.95, {4}), (2.05, {3, 4, 5})])
 def test_positives_by_hand(length_m: float, columns: set[int]) -> None:
     """A short car on the center of a cell, whose neighbors overlap it enough, but stand 1 m away.
@@ -129,42 +97,6 @@ def test_positives_by_hand(length_m: float, columns: set[int]) -> None:
     targets = assign((CAR, [4.0, 3.0, -1.0, length_m, 1.6, 1.56, 0.0]))
     assert places(targets, 1) == {(3, column, 0) for column in columns}
     assert not (targets.state == -1).any()
-
-
-def test_a_pedestrian_between_the_centers_keeps_its_best_anchor() -> None:
-    """0.45 and 0.4 m from the nearest center, beyond its faces; the turned anchor shares 0.25 x 0.3, the other 0.07."""
-    targets = assign((PEDESTRIAN, [3.45, 3.4, -0.6, 0.8, 0.6, 1.73, 0.0]))
-    assert places(targets, 1) == {(3, 3, 3)}
-
-
-def test_an_anchor_of_two_boxes() -> None:
-    """The car of the anchor's size would also have the next column, which it overlaps by 2.9 / 4.9 = 0.59.
-
-    A narrow one, 3.0 x 1.0 m, lies within that anchor, 3 / 6.24 = 0.48, and within no other: it is its own. A short one
-    on the car's own center has nothing better either, but overlaps it less.
-    """
-    fitting = [4.0, 3.0, -1.0, 3.9, 1.6, 1.56, 0.0]
-    narrow, short = [5.4, 3.0, -1.0, 3.0, 1.0, 1.56, 0.0], [4.0, 3.1, -1.0, 2.0, 1.6, 1.56, 0.0]
-    for other, column, winner in ((narrow, 5, narrow), (short, 4, fitting)):
-        for order in ([fitting, other], [other, fitting]):
-            targets = assign(*((CAR, box) for box in order))
-            taken = dict(zip(targets.positives.tolist(), targets.matched.tolist(), strict=True))
-            assert taken[(3 * 9 + column) * COUNT] == order.index(winner)
-            assert taken[(3 * 9 + 3) * COUNT] == order.index(fitting)
-
-
-def test_without_thresholds_only_ignored_boxes_ignore() -> None:
-    box = [4.0, 3.0, -1.0, 3.9, 1.6, 1.56, 0.0]
-    alone, both, ignored = assign((CAR, box)), assign((CAR, box), (IGNORED, box)), assign((IGNORED, box))
-    assert places(alone, 1) == places(both, 1) == {(3, column, 0) for column in (3, 4, 5)}
-    assert not (alone.state == -1).any() and not (ignored.state == 1).any()
-    assert places(ignored, -1) == {(3, column, 0) for column in (3, 4, 5)}
-    assert not (both.state == -1).any()
-
-
-@pytest.mark.parametrize(("x", "y"), [(-3.0, 4.0), (12.0, 4.0), (500.0, 0.0)])
-def test_boxes_far_outside_change_nothing(x: float, y: float) -> None:
-    assert not assign((PEDESTRIAN, [x, y, -0.6, 0.8, 0.6, 1.73, 0.0])).state.any()
 
 
 def test_fewer_cells_than_candidates() -> None:

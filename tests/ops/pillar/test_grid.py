@@ -8,20 +8,12 @@ import numpy as np
 import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
-from pydantic import TypeAdapter, ValidationError
 
 from asca_pillars.base.errors import ConfigError
 from asca_pillars.ops.pillar.grid import HEAD_STRIDE, NECK_STRIDE, PillarGrid
 
 # x: 3 zones x 8 columns x 0.32 m = 7.68 m, twice; y: 8 rows x 0.16 m = 1.28 m, eight times.
 SMALL = PillarGrid(x_range_m=(2.0, 17.36), y_range_m=(-3.2, 7.04), z_range_m=(-2.5, 1.5))
-GRIDS = [
-    PillarGrid(),
-    SMALL,
-    PillarGrid(zones=1, v_max_m=0.16),
-    PillarGrid(x_range_m=(-10.24, 10.24), y_range_m=(1.28, 8.96), zones=2),
-    PillarGrid(x_range_m=(5.0, 69.0), y_range_m=(-8.0, 4.0), zones=5, v_max_m=0.8, v_y_m=0.25),
-]
 
 
 @st.composite
@@ -47,12 +39,6 @@ def test_default_is_the_papers_grid() -> None:
     assert (grid.nx, grid.ny) == (504, 496)
     assert grid.head_shape == (248, 252)
     np.testing.assert_allclose(np.diff(grid.y_edges_m), 0.16)
-
-
-def test_one_zone_is_pointpillars() -> None:
-    grid = PillarGrid(zones=1, v_max_m=0.16)
-    assert (grid.nx, grid.ny) == (432, 496)
-    np.testing.assert_allclose(np.diff(grid.x_edges_m), 0.16)
 
 
 @given(grids())
@@ -125,39 +111,6 @@ def test_cells_equal_a_search_of_the_borders(grid: PillarGrid, seed: int) -> Non
     cells = grid.cells(points)
     assert cells.dtype == np.int64
     assert cells.tolist() == cells_by_search(grid, points)
-
-
-@pytest.mark.parametrize("grid", GRIDS)
-def test_lower_ends_are_inside_and_upper_ends_outside(grid: PillarGrid) -> None:
-    spans = np.array([grid.x_range_m, grid.y_range_m, grid.z_range_m])
-    lowest = spans[:, 0].astype(np.float32)
-    assert grid.cells(lowest[None]).tolist() == [0]
-    highest_inside = np.nextafter(spans[:, 1].astype(np.float32), np.float32(-np.inf))
-    assert grid.cells(highest_inside[None]).tolist() == [grid.nx * grid.ny - 1]
-    for axis in range(3):
-        outside = lowest.copy()
-        outside[axis] = spans[axis, 1]
-        assert grid.cells(outside[None]).tolist() == [-1]
-        outside[axis] = np.nextafter(lowest[axis], np.float32(-np.inf))
-        assert grid.cells(outside[None]).tolist() == [-1]
-
-
-def test_rows_run_along_y_and_columns_along_x() -> None:
-    # 2 m + one pillar of 0.32 m and a bit: column 1; -3.2 m + two pillars of 0.16 m and a bit: row 2.
-    point = np.array([[2.33, -2.87, 0.0, 0.5]], np.float32)
-    assert SMALL.cells(point).tolist() == [2 * SMALL.nx + 1]
-
-
-def test_cells_of_nothing() -> None:
-    cells = SMALL.cells(np.empty((0, 4), np.float32))
-    assert cells.shape == (0,) and cells.dtype == np.int64
-    assert SMALL.cell_centers_m(cells).shape == (0, 2)
-
-
-@pytest.mark.parametrize("shape", [(5,), (5, 2), (1, 5, 4)])
-def test_cells_refuses_other_shapes(shape: tuple[int, ...]) -> None:
-    with pytest.raises(ValueError, match=re.escape(str(shape))):
-        SMALL.cells(np.zeros(shape, np.float32))
 
 
 @pytest.mark.parametrize(
@@ -237,12 +190,3 @@ def test_a_grid_is_a_value() -> None:
         SMALL.zones = 2  # type: ignore[misc]
     with pytest.raises(ValueError, match="read-only"):
         SMALL.x_edges_m[0] = 1.0
-
-
-def test_a_config_with_a_typo_is_refused() -> None:
-    loader = TypeAdapter(PillarGrid)
-    assert loader.validate_python({"zones": 1, "v_max_m": 0.16}).nx == 432
-    with pytest.raises(ValidationError, match="zonez"):
-        loader.validate_python({"zonez": 1})
-    with pytest.raises(ConfigError, match="use x_range_m"):
-        loader.validate_python({"x_range_m": (0, 70)})
