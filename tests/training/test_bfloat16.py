@@ -1,6 +1,5 @@
 """`train.precision`: what it means on machines with and without bfloat16."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -12,7 +11,7 @@ from asca_pillars.training.loop import train
 from asca_pillars.training.module import has_bfloat16, resolve_precision
 from tests.helpers.scenes import write_dataset
 from tests.helpers.shipped_configs import CONFIGS
-from tests.helpers.tiny_run import CONFIG
+from tests.helpers.tiny_run import with_train
 
 
 @pytest.mark.parametrize(
@@ -49,27 +48,18 @@ def test_bf16_where_there_is_none_is_said(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr("asca_pillars.training.loop.has_bfloat16", lambda: False)
-    config = replace(CONFIG, train=replace(CONFIG.train, epochs=1, precision="bf16"))
-    train(config, write_dataset(tmp_path / "data", 3), tmp_path / "run")
+    train(with_train(epochs=1, precision="bf16"), write_dataset(tmp_path / "data", 3), tmp_path / "run")
     assert "train.precision = bf16: this device has no bfloat16" in " ".join(capsys.readouterr().out.split())
 
 
-@pytest.mark.parametrize("written", ["fp32", "auto"])  # auto: by an older version
-def test_a_run_goes_on_in_the_precision_it_was_started_in(
-    written: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    config = replace(CONFIG, train=replace(CONFIG.train, epochs=1, precision="auto"))
-    data, run = write_dataset(tmp_path / "data", 3), tmp_path / "run"
-    monkeypatch.setattr(bfloat16, "has_bfloat16", lambda device: False)
-    train(config, data, run)
-    path = run / "config.yaml"
-    assert load_config(path).train.precision == "fp32"
-
-    path.write_text(path.read_text().replace("precision: fp32", f"precision: {written}"))
-    monkeypatch.setattr(bfloat16, "has_bfloat16", lambda device: True)
-    train(replace(config, train=replace(config.train, epochs=2)), data, run)
-
-    assert load_config(path).train.precision == {"fp32": "fp32", "auto": "bf16"}[written]
+def test_a_run_goes_on_in_the_precision_it_was_started_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    data, run, path = write_dataset(tmp_path / "data", 3), tmp_path / "run", tmp_path / "run" / "config.yaml"
+    for epochs, has_it, resolved in ((1, False, "fp32"), (2, True, "fp32"), (3, True, "bf16")):
+        monkeypatch.setattr(bfloat16, "has_bfloat16", lambda device, has_it=has_it: has_it)
+        if epochs == 3:  # an older version did not record it
+            path.write_text(path.read_text().replace("precision: fp32", "precision: auto"))
+        train(with_train(epochs=epochs, precision="auto"), data, run)
+        assert load_config(path).train.precision == resolved
 
 
 def test_configurations_that_ship_run_anywhere() -> None:

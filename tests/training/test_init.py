@@ -11,34 +11,31 @@ from asca_deploy.shipped import find_checkpoint
 from asca_pillars.base import installation
 from asca_pillars.base.errors import BundleError, TrainingError
 from asca_pillars.config.pillar import PillarModel
-from asca_pillars.models.checkpoint import load_checkpoint
+from asca_pillars.models.build import build_model
+from asca_pillars.models.checkpoint import Checkpoint, load_checkpoint
 from asca_pillars.training.loop import train
+from tests.helpers.saved_checkpoint import save_checkpoint
 from tests.helpers.scenes import write_dataset
-from tests.helpers.tiny_run import CONFIG, NETWORK
+from tests.helpers.tiny_run import CONFIG, NETWORK, with_train
 
-STILL = dataclasses.replace(CONFIG, train=dataclasses.replace(CONFIG.train, epochs=1, learning_rate=1e-12))
+STILL = with_train(epochs=1, learning_rate=1e-12)
 OTHER = dataclasses.replace(CONFIG, model=PillarModel(network=dataclasses.replace(NETWORK, pillar_channels=8)))
 
 
 def test_a_run_can_start_from_other_weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    data = write_dataset(tmp_path / "data", 3)
-    first = train(CONFIG, data, tmp_path / "first")
-    bundle = tmp_path / "bundle"
+    data, bundle, first = write_dataset(tmp_path / "data", 3), tmp_path / "bundle", tmp_path / "first.ckpt"
+    torch.manual_seed(3)
+    other = Checkpoint(CONFIG, build_model(CONFIG.model), 7)
+    save_checkpoint(first, other)
     bundle.mkdir()
-    first.with_name("weights.ckpt").rename(bundle / "weights.ckpt")
+    first_weights = bundle / "weights.ckpt"
+    first_weights.write_bytes(first.read_bytes())
     for module in (shipped, installation):
         monkeypatch.setattr(module, "shipped_models", lambda: {"a_model": bundle})
-    sources: dict[str | Path, Path] = {
-        first: first,
-        bundle: bundle / "weights.ckpt",
-        "a_model": bundle / "weights.ckpt",
-    }
-    for number, (init, source) in enumerate(sources.items()):
-        found = load_checkpoint(
-            train(STILL, data, tmp_path / str(number), init=find_checkpoint(init))
-        ).detector.parameters()
-        for expected, parameter in zip(load_checkpoint(source).detector.parameters(), found, strict=True):
-            torch.testing.assert_close(parameter, expected, msg=f"{parameter.shape} from {init}")
+    assert [find_checkpoint(init) for init in (first, bundle, "a_model")] == [first, first_weights, first_weights]
+    found = load_checkpoint(train(STILL, data, tmp_path / "run", init=first_weights)).detector.parameters()
+    for expected, parameter in zip(other.detector.parameters(), found, strict=True):
+        torch.testing.assert_close(parameter, expected)
     for init, error, message in (
         (first, TrainingError, r"another network: \S+ is \(16, 9\) there and \(8, 9\) in this configuration"),
         ("another", BundleError, "no bundle of that name ships"),

@@ -8,9 +8,8 @@ import pytest
 import torch
 
 from asca_pillars.base.errors import ConfigError, TrainingError
-from asca_pillars.base.schema import parse, to_dict
 from asca_pillars.config.pv_rcnn import PvRcnnModel
-from asca_pillars.config.tree import Config, load_config, pillar_spec
+from asca_pillars.config.tree import load_config, pillar_spec
 from asca_pillars.data.kitti import KittiSplit
 from asca_pillars.models.checkpoint import load_checkpoint
 from asca_pillars.models.scan_detector import ScanDetector
@@ -56,12 +55,6 @@ def test_the_second_stage_alone_on_a_trained_first_one(tmp_path: Path) -> None:
     alone = tiny_config(dataclasses.replace(MODEL, network=wider, train_first_stage=False), epochs=1)
     with pytest.raises(TrainingError, match=r"another network: network\.voxels\..* in this configuration"):
         train(alone, data, tmp_path / "other", init=both)
-
-
-def test_a_configuration_comes_back_from_its_file() -> None:
-    config = load_config("pvrcnn_small_sim")
-    assert parse(Config, to_dict(config), "config.yaml") == config
-    assert config.model.kind == "pv_rcnn"
 
 
 def test_what_cannot_be() -> None:
