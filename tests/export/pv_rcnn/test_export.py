@@ -58,7 +58,7 @@ def test_train_export_detect(trained: Trained, tmp_path: Path) -> None:
     bundle = load_bundle(folder)
     assert isinstance(bundle, PvRcnnBundle) and set(bundle.graphs) == {*GRAPHS["pv_rcnn"], DEFORM}
     assert bundle.parity is not None and bundle.parity.scans == len(SCANS) and bundle.backbone_gmac > 0
-    assert_same_detector(checkpoint, folder, tmp_path)
+    assert_same_detector(checkpoint, folder)
 
 
 @pytest.mark.parametrize("threads", [2, 4])

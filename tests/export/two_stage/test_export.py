@@ -72,7 +72,7 @@ def test_train_export_detect(trained: tuple[Path, Path], tmp_path: Path) -> None
     bundle = load_pillar_bundle(folder)
     assert (bundle.kind, set(bundle.graphs)) == ("pillar_refine", set(GRAPHS["pillar_refine"]))
     assert bundle.parity is not None and bundle.parity.scans == len(SCANS) and bundle.refine is not None
-    assert_same_detector(load_checkpoint(last), folder, tmp_path)
+    assert_same_detector(load_checkpoint(last), folder)
 
 
 def test_a_sparse_neck_on_a_pooled_map_proposes(tmp_path: Path) -> None:

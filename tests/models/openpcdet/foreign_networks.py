@@ -48,11 +48,8 @@ class MapBackbone(nn.Module):
                 ]
             self.blocks.append(nn.Sequential(*layers))
             step = total // strides[0]
-            self.deblocks.append(
-                nn.Sequential(
-                    nn.ConvTranspose2d(width, up, step, step, bias=False), nn.BatchNorm2d(up, eps=1e-3), nn.ReLU()
-                )
-            )
+            upsampling = nn.ConvTranspose2d(width, up, step, step, bias=False)
+            self.deblocks.append(nn.Sequential(upsampling, nn.BatchNorm2d(up, eps=1e-3), nn.ReLU()))
             channels = width
 
     def forward(self, features: Tensor) -> Tensor:
@@ -66,14 +63,16 @@ class MapBackbone(nn.Module):
 class AnchorHead(nn.Module):
     """AnchorHeadSingle: every anchor has a score for every class."""
 
+    BOXES = "conv_box"
+
     def __init__(self, channels: int, anchors: int, classes: int) -> None:
         super().__init__()
         self.conv_cls = nn.Conv2d(channels, anchors * classes, 1)
-        self.conv_box = nn.Conv2d(channels, anchors * 7, 1)
+        setattr(self, self.BOXES, nn.Conv2d(channels, anchors * 7, 1))
         self.conv_dir_cls = nn.Conv2d(channels, anchors * 2, 1)
 
     def forward(self, features: Tensor) -> list[Tensor]:
-        return [self.conv_cls(features), self.conv_box(features), self.conv_dir_cls(features)]
+        return [layer(features) for layer in self.children()]
 
 
 class PillarLayer(nn.Module):
@@ -119,6 +118,15 @@ def fully_connected(channels: int, hidden: int, out: int | None) -> nn.Sequentia
         layers += [nn.Dropout(0.3)] if number == 0 else []
         channels = hidden
     return nn.Sequential(*layers, *([] if out is None else [nn.Conv1d(channels, out, 1)]))
+
+
+def foreground(channels: int, hidden: int) -> nn.Sequential:
+    """Of the weights of keypoints."""
+    return nn.Sequential(
+        *(nn.Linear(channels, hidden, bias=False), nn.BatchNorm1d(hidden), nn.ReLU()),
+        *(nn.Linear(hidden, hidden, bias=False), nn.BatchNorm1d(hidden), nn.ReLU()),
+        nn.Linear(hidden, 1),
+    )
 
 
 class SparseLayer(nn.Sequential):
@@ -173,11 +181,7 @@ class PvRcnn(nn.Module):
             nn.Linear(joined, keypoint, bias=False), nn.BatchNorm1d(keypoint), nn.ReLU()
         )
         self.point_head = nn.Module()
-        self.point_head.cls_layers = nn.Sequential(
-            *(nn.Linear(joined, weighting, bias=False), nn.BatchNorm1d(weighting), nn.ReLU()),
-            *(nn.Linear(weighting, weighting, bias=False), nn.BatchNorm1d(weighting), nn.ReLU()),
-            nn.Linear(weighting, 1),
-        )
+        self.point_head.cls_layers = foreground(joined, weighting)
         size, radii, mlp, hidden = grid
         self.roi_head = nn.Module()
         self.roi_head.roi_grid_pool_layer = nn.Module()

@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from tests.models.openpcdet.foreign_networks import SparseLayer
+from tests.models.openpcdet.foreign_networks import AnchorHead, PillarLayer, SparseLayer, foreground
 
 
 def write_mmdetection3d(path: Path, state: dict[str, Tensor], **meta: Any) -> Path:
@@ -68,30 +68,10 @@ class Neck(nn.Module):
         return torch.cat([deblock(each) for deblock, each in zip(self.deblocks, maps, strict=True)], dim=1)
 
 
-class Anchor3DHead(nn.Module):
+class Anchor3DHead(AnchorHead):
     """Its three 1x1 convolutions."""
 
-    def __init__(self, channels: int, anchors: int, classes: int) -> None:
-        super().__init__()
-        self.conv_cls = nn.Conv2d(channels, anchors * classes, 1)
-        self.conv_reg = nn.Conv2d(channels, anchors * 7, 1)
-        self.conv_dir_cls = nn.Conv2d(channels, anchors * 2, 1)
-
-    def forward(self, features: Tensor) -> list[Tensor]:
-        return [self.conv_cls(features), self.conv_reg(features), self.conv_dir_cls(features)]
-
-
-class PillarLayer(nn.Module):
-    """PFNLayer, the last of one: (P, slots, 10) -> the maximum over all slots, zeros included."""
-
-    def __init__(self, channels: int) -> None:
-        super().__init__()
-        self.linear = nn.Linear(10, channels, bias=False)
-        self.norm = nn.BatchNorm1d(channels, eps=1e-3)
-
-    def forward(self, features: Tensor) -> Tensor:
-        values = self.norm(self.linear(features).permute(0, 2, 1)).permute(0, 2, 1)
-        return torch.relu(values).max(dim=1).values
+    BOXES = "conv_reg"
 
 
 class PointPillars(nn.Module):
@@ -106,21 +86,6 @@ class PointPillars(nn.Module):
         self.backbone = Backbone2d(channels, widths, convs, (2, 2, 2))
         self.neck = Neck(widths, up, (1, 2, 4))
         self.bbox_head = Anchor3DHead(3 * up, 2 * classes, classes)
-
-
-def pillar_features(points: Tensor, counts: Tensor, centers: Tensor, *, legacy: bool) -> Tensor:
-    """Features (P, slots, 10) of padded points (P, slots, 4), of which pillar i has counts[i] and its center.
-
-    With `legacy` the offsets to the center are written over x, y and z, before these are joined with the others.
-    """
-    points = points.clone()
-    mean = points[:, :, :3].sum(dim=1, keepdim=True) / counts[:, None, None]
-    from_mean = points[:, :, :3] - mean
-    from_center = points[:, :, :3] - centers[:, None]
-    if legacy:
-        points[:, :, :3] = from_center
-    present = torch.arange(points.shape[1])[None, :, None] < counts[:, None, None]
-    return torch.cat([points, from_mean, from_center], dim=2) * present
 
 
 def set_abstraction(channels: int, radii: int, widths: Sequence[int]) -> nn.Module:
@@ -188,11 +153,7 @@ class PvRcnn(nn.Module):
         self.points_encoder.point_feature_fusion_layer = nn.Sequential(ConvModule(joined, keypoint))
         self.roi_head = nn.Module()
         self.roi_head.semantic_head = nn.Module()
-        self.roi_head.semantic_head.seg_cls_layer = nn.Sequential(
-            *(nn.Linear(joined, weighting, bias=False), nn.BatchNorm1d(weighting), nn.ReLU()),
-            *(nn.Linear(weighting, weighting, bias=False), nn.BatchNorm1d(weighting), nn.ReLU()),
-            nn.Linear(weighting, 1),
-        )
+        self.roi_head.semantic_head.seg_cls_layer = foreground(joined, weighting)
         size, radii, mlp, hidden = grid
         self.roi_head.bbox_roi_extractor = nn.Module()
         self.roi_head.bbox_roi_extractor.roi_grid_pool_layer = set_abstraction(keypoint, radii, mlp)

@@ -49,13 +49,6 @@ def test_features_are_adjusted_as_eq_10_says() -> None:
             np.testing.assert_allclose(own[i], expected, atol=1e-12)
 
 
-def test_gradients() -> None:
-    torch.manual_seed(0)
-    module, counted = random_adjustment(4), torch.tensor([[1.0, 1, 0], [1, 1, 1]], dtype=torch.float64)
-    features = torch.randn(2, 3, 4, dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(lambda values, *_: module(values, counted), (features, *module.parameters()))
-
-
 def test_the_first_keypoints_are_what_sampling_them_again_takes() -> None:
     points = cloud(3, 300, 3.0, coarse=False)
     keypoints = np.ascontiguousarray(points[farthest_points(points, 60), :3])

@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from torch.nn import functional as F  # noqa: N812  (torch's own convention)
 
 from asca_pillars.base.errors import ConfigError
 from asca_pillars.config.pv_rcnn import PvRcnnModel, PvRcnnNetwork
@@ -19,7 +18,6 @@ from asca_pillars.models.pv_rcnn.network import PvRcnnDetector
 from asca_pillars.models.pv_rcnn.preparation import LabeledVoxels
 from asca_pillars.ops.pv_rcnn.prepare import VoxelSetSettings
 from tests.models.pv_rcnn.tiny_pv_rcnn import MODEL, SPEC, VARIANTS, batch, frame, tiny_detector
-from tests.ops.sparse.dense_volumes import at_cells, dense
 
 EVERY_ANCHOR = AnchorProposals(candidates=3000, nms_iou=0.95, count=3000)
 
@@ -67,27 +65,6 @@ def test_the_published_model_has_its_published_size() -> None:
         "refine": 25_472 + 7_144_448 + 132_353 + 133_895,
     }
     assert sum(counts.values()) == 13_115_697
-
-
-def test_voxels_are_convolved_as_densely() -> None:
-    detector = seeing_detector()
-    scans = batch(detector, frame(0)).scans
-    features, levels = scans.features.double(), scans.levels
-    backbone = detector.network.voxels.double()
-    with torch.inference_mode():
-        found = backbone(features, levels)
-        for number, (shape, level) in enumerate(zip(SPEC.level_shapes, levels, strict=True)):
-            layers = list(backbone.same[number].children()) if number < len(backbone.same) else []
-            before = SPEC.level_shapes[max(number - 1, 0)], levels[max(number - 1, 0)].cells.numpy()
-            convolutions: list[Any] = [(layer, 1, 1, (shape, level.cells.numpy())) for layer in layers]
-            if number:
-                strided = SPEC.strided[number - 1]
-                convolutions.insert(0, (backbone.down[number - 1], strided.stride, strided.padding, before))
-            for layer, stride, padding, (lattice, cells) in convolutions:
-                volume = dense(features.numpy(), cells, lattice)
-                volume = F.conv3d(volume, layer.convolution.weight, stride=stride, padding=padding)
-                features = torch.relu(layer.norm(torch.from_numpy(at_cells(volume, level.cells.numpy()))))
-            torch.testing.assert_close(found[number], features)
 
 
 def test_shapes_and_the_canvas() -> None:

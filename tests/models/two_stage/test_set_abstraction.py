@@ -79,14 +79,6 @@ def test_an_empty_ball_is_the_mlp_of_zero_wherever_it_is() -> None:
         torch.testing.assert_close(module(positions, features, moved, indices)[1], zero)
 
 
-def test_gradients() -> None:
-    torch.manual_seed(0)
-    module = SetAbstraction(2, (3, 2)).double().eval()
-    positions, features, queries, indices = balls(torch.float64)
-    inputs = [part.requires_grad_() for part in (positions, features, queries)]
-    assert torch.autograd.gradcheck(lambda p, f, q: module(p, f, q, indices), inputs)
-
-
 def test_no_points_and_no_queries() -> None:
     module = SetAbstraction(1, (4,)).eval()
     nothing = torch.zeros(3, 2, dtype=torch.int32)

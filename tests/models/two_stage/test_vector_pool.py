@@ -1,7 +1,6 @@
 """VectorPool against its equations, cell by cell."""
 
 import numpy as np
-import pytest
 import torch
 
 from asca_pillars.models.two_stage.sets import VectorPool
@@ -68,17 +67,6 @@ def test_where_a_point_stands_decides_which_weights_it_meets() -> None:
         rows = torch.from_numpy(nearest_in_cubes(points.numpy(), queries.numpy(), HALF_M, 3))
         found.append(pool(points, features, queries, rows))
     assert (found[0] - found[1]).abs().max() > 1e-3
-
-
-@pytest.mark.parametrize("training", [True, False])
-def test_gradients(training: bool) -> None:
-    pool, (points, features, queries, rows) = random_pool(2).train(training), scene(2)
-    fixed = torch.from_numpy(points), torch.from_numpy(queries), torch.from_numpy(rows)
-    weights = (pool.places, pool.features.weight)
-    given = torch.from_numpy(features).requires_grad_()
-    assert torch.autograd.gradcheck(
-        lambda of_points, *_: pool(fixed[0], of_points, *fixed[1:]), (given, *weights), fast_mode=True
-    )
 
 
 def test_no_points_and_no_queries() -> None:
