@@ -1,14 +1,28 @@
 """A bundle finds what its checkpoint finds: one scan after the other, streamed, and in threads."""
 
+import json
+import shutil
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from asca_deploy import Detector
+from asca_deploy.bundle import MANIFEST
 from asca_pillars.models.checkpoint import Checkpoint
 from asca_pillars.models.scan_detector import ScanDetector
 from tests.export.tiny import SCANS
+
+
+def changed_manifest(folder: Path, out: Path, change: Callable[[Any], object]) -> Path:
+    """A copy of the bundle whose manifest somebody has edited."""
+    shutil.copytree(folder, out)
+    data = json.loads((out / MANIFEST).read_text())
+    change(data)
+    (out / MANIFEST).write_text(json.dumps(data))
+    return out
 
 
 def assert_same_detector(checkpoint: Checkpoint, folder: Path) -> None:

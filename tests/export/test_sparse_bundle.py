@@ -20,8 +20,7 @@ from asca_pillars.base.errors import ConfigError, ProviderError
 from asca_pillars.config.pillar import PillarModel
 from asca_pillars.models.checkpoint import Checkpoint
 from asca_pillars.models.scan_detector import ScanDetector
-from tests.export.tiny import CALIBRATION, SCANS
-from tests.export.tiny_sparse import NOTHING, ONE_POINT, sparse_checkpoint
+from tests.export.tiny import CALIBRATION, NOTHING, ONE_POINT, SCANS, sparse_checkpoint
 from tests.helpers.same_detections import same
 from tests.helpers.scenes import SPEC
 
