@@ -99,18 +99,6 @@ def test_equals_a_plain_loop(
     np.testing.assert_allclose(detections.scores, [1 / (1 + math.exp(-x)) for x, _, _ in expected], rtol=1e-6)
     np.testing.assert_array_equal(detections.boxes, np.reshape([box for _, _, box in expected], (-1, 7)))
     assert detections.class_names == NAMES
-
-
-def test_boxes_come_back_from_the_maps() -> None:
-    maps = quiet_maps()
-    car = np.array([9.1, 3.3, -0.9, 4.2, 1.7, 1.5, 2.8], np.float32)
-    cyclist = np.array([4.0, -1.0, -0.5, 1.8, 0.5, 1.7, -1.4], np.float32)
-    write(maps, 1, 20, 12, car, 2.0)  # a car's 90 degree anchor
-    write(maps, 4, 7, 3, cyclist, 3.0)
-    detections = decode(maps, ANCHORS, CLASSES, PostProcess())
-    np.testing.assert_allclose(detections.boxes, [cyclist, car], atol=1e-5)
-    np.testing.assert_allclose(detections.scores, 1 / (1 + np.exp([-3.0, -2.0])), rtol=1e-6)
-    assert detections.names == ["Cyclist", "Car"]
     kinds = (detections.boxes.dtype, detections.scores.dtype, detections.labels.dtype)
     assert kinds == (np.float32, np.float32, np.int64)
 

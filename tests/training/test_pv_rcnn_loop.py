@@ -65,6 +65,11 @@ def test_what_cannot_be() -> None:
         ("model.settings.sources=[{source: conv5, radii_m: [1], samples: [2]}]", "conv5"),
         ("model.settings.keypoint=3", "did you mean `keypoints`"),
         ("model.network.source_widths=[[8]]", "give one for each of model.settings.sources"),
+        ("model.network.dropout=1", "model.network.dropout = 1"),
+        ("model.network.grid_widths=[]", "model.network.grid_widths"),
+        ("model.network.block_convs=[-1, 1]", "model.network.block_convs"),
+        ("model.settings.keypoints=0", "keypoints 0"),
+        ("model.settings.grid_radii_m=[]", "grid_radii_m"),
         ("model.kind=pvrcnn", "input should be"),
     ):
         with pytest.raises(ConfigError, match=message):

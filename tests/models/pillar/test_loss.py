@@ -108,18 +108,6 @@ def test_box_loss_by_hand() -> None:
     assert box_loss(residuals, targets, 1 / 9).item() == pytest.approx(sum(found))
 
 
-def test_half_a_turn_is_a_matter_of_direction_alone() -> None:
-    _, _, targets = scene_targets(0)
-    batch, right = batched([targets]), perfect_maps([targets])
-    half_turn = torch.zeros(7 * COUNT)
-    half_turn[6::7] = math.pi
-    turned = right._replace(boxes=right.boxes + half_turn[:, None, None])
-    assert detection_loss(turned, batch, CONFIG).box.item() == pytest.approx(0, abs=1e-9)
-    swapped = right._replace(directions=-right.directions)  # the other bin is ahead by the margin of 30
-    terms = detection_loss(swapped, batch, CONFIG)
-    assert terms.box.item() == 0 and terms.direction.item() == pytest.approx(0.2 * 30)
-
-
 def test_direction_by_hand() -> None:
     """Two bins that are equal cost ln 2 for each positive, a right one ahead by ln 3 costs ln(4/3)."""
     _, _, targets = scene_targets(0)
@@ -205,20 +193,6 @@ def positive_rows(maps: HeadMaps[Tensor], targets: TargetBatch) -> tuple[Tensor,
     boxes = maps.boxes.permute(0, 2, 3, 1).reshape(-1, 7)
     scores = maps.scores.permute(0, 2, 3, 1).reshape(-1)
     return boxes[targets.positives], scores[targets.positives]
-
-
-def test_overlaps_by_hand() -> None:
-    """A box that is its anchor, moved by a tenth of the diagonal; raised by a quarter; half as long; turned."""
-    anchors = torch.tensor([[10.0, 2.0, -1.0, 4.0, 3.0, 1.6, 0.0]]).repeat(6, 1)
-    wanted, found = torch.zeros(6, 7), torch.zeros(6, 7)
-    found[1, 0] = 0.1  # 0.5 m of 4: 3.5 / 4.5
-    found[2, 2] = 0.25  # 0.75 / 1.25
-    found[3, 3] = math.log(0.5)
-    found[4, 6] = math.pi  # the direction bins tell it apart, not the overlap
-    found[5, 6] = math.pi / 2  # 3 x 3 of 4 x 3 and 3 x 4
-    batch = TargetBatch(torch.zeros(1), torch.arange(6), anchors, wanted, torch.zeros(6, dtype=torch.int64))
-    expected = [1, 3.5 / 4.5, 0.6, 0.5, 1, 9 / 15]
-    np.testing.assert_allclose(overlaps_found(found, batch).numpy(), expected, rtol=1e-5)
 
 
 @given(st.integers(0, 2**32 - 1))

@@ -30,16 +30,6 @@ def _points(count: int = 600, seed: int = 0) -> np.ndarray:
     return rng.uniform(low, high, (count, 4)).astype(np.float32)
 
 
-def test_shapes_follow_the_grid() -> None:
-    height, width = SPEC.grid.head_shape
-    assert (SPEC.grid.ny, SPEC.grid.nx) == (128, 112) and (height, width) == (64, 56)
-    batch = batch_pillars([SPEC.pillarize(_points(seed=1)), SPEC.pillarize(_points(seed=2))])
-    maps = _detector()(batch)
-    assert maps.scores.shape == (2, 6, height, width)
-    assert maps.boxes.shape == (2, 42, height, width)
-    assert maps.directions.shape == (2, 12, height, width)
-
-
 def test_neck_has_table_1s_widths_and_size() -> None:
     neck = RPNNeck(64, (64, 128, 256), (3, 3, 3), 128)
     assert neck(torch.zeros(1, 64, 16, 24)).shape == (1, 384, 8, 12)

@@ -23,15 +23,6 @@ from tests.models.two_stage.small_refiner import (
 )
 
 
-def test_shapes() -> None:
-    inputs, targets = batch((0, 1))
-    found = small_refiner()(inputs)
-    assert found.confidence.shape == targets.confidence.shape == (32,)
-    assert found.residuals.shape == targets.residuals.shape == (32, 7)
-    assert found.keypoint_logits.shape == targets.keypoint_states.shape
-    assert targets.positive.any() and (targets.keypoint_states == 1).any()
-
-
 def test_an_untrained_head_hardly_moves_proposals() -> None:
     assert small_refiner().eval()(batch((0,)).inputs).residuals.abs().max() < 0.05
 

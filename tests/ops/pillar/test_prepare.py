@@ -105,15 +105,6 @@ def test_an_even_subset_has_steps_that_differ_by_one(count: int, most: int) -> N
     assert steps.max() - steps.min() <= 1
 
 
-def test_memory_layout_does_not_matter() -> None:
-    points, limits = cloud(6, 1000, 1.0), PillarLimits(30, 2)
-    expected = pillarize(points, GRID, limits).features
-    wide = np.zeros((1000, 6), np.float32)
-    wide[:, :4] = points
-    np.testing.assert_array_equal(pillarize(wide[:, :4], GRID, limits).features, expected)
-    np.testing.assert_array_equal(pillarize(np.asfortranarray(points), GRID, limits).features, expected)
-
-
 @pytest.mark.parametrize(
     "points", [np.empty((0, 4)), np.full((3, 4), 1000.0), np.full((3, 4), np.nan)], ids=["empty", "outside", "nan"]
 )
