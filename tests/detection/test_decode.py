@@ -143,15 +143,6 @@ def test_scores_do_not_overflow() -> None:
     assert scores[0] == 1 and (scores[1:] == 0).all()
 
 
-def test_maps_of_another_model_are_refused() -> None:
-    maps = quiet_maps()
-    swapped = HeadMaps(*(m.transpose(0, 2, 1) for m in maps))
-    with pytest.raises(ValueError, match=r"\(6, 32, 56\).*not.*\(6, 56, 32\)"):
-        decode(swapped, ANCHORS, CLASSES, PostProcess())
-    with pytest.raises(ValueError, match="2 classes"):
-        decode(maps, ANCHORS, CLASSES[:2], PostProcess())
-
-
 @pytest.mark.parametrize("settings", [{"nms_iou": -0.1}, {"nms_iou": 1.1}, {"candidates": 0}, {"max_detections": 0}])
 def test_impossible_settings_are_refused(settings: dict[str, float]) -> None:
     with pytest.raises(ConfigError, match=next(iter(settings))):

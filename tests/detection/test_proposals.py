@@ -37,11 +37,6 @@ def test_nothing_and_less_than_the_quota() -> None:
     assert len(best_of_each_class(found([1], [0.1]), (5, 5))) == 1
 
 
-def test_one_quota_for_each_class() -> None:
-    with pytest.raises(ValueError, match="1 quotas for the 2 classes"):
-        best_of_each_class(found([1], [0.1]), (5,))
-
-
 def test_suppression_that_stops_at_the_quotas_proposes_the_same() -> None:
     height, width, count, _ = SPEC.anchors.shape
     rng = np.random.default_rng(0)
@@ -100,8 +95,6 @@ def test_limits_and_numbers_that_are_not_finite() -> None:
 
 
 def test_what_cannot_be() -> None:
-    with pytest.raises(ValueError, match="must have shapes"):
-        propose_anchors(anchor_maps()._replace(scores=anchor_maps().scores[:6]), VOXELS, AnchorProposals())
     with pytest.raises(ConfigError, match="nms_iou 2"):
         AnchorProposals(nms_iou=2.0)
     with pytest.raises(ConfigError, match="at least 1"):

@@ -1,23 +1,44 @@
-"""Target assignment against a plain loop over all anchors, and by hand."""
+"""Both assignments of targets against plain loops over all anchors, and by hand."""
 
 import math
+import statistics
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
-from hypothesis import given, settings
+import pytest
+from hypothesis import assume, given, settings
 
-from asca_pillars.detection.anchors import IGNORED, KITTI_CLASSES
-from asca_pillars.detection.targets import Targets, assign_targets
+from asca_pillars.detection.anchors import IGNORED, KITTI_CLASSES, make_anchors
+from asca_pillars.detection.targets import Assigner, Targets, assign_targets
 from asca_pillars.geometry.boxes import decode_boxes, wrap_angle
 from asca_pillars.geometry.overlap import aligned_bev_iou
-from tests.detection.anchor_scenes import ANCHORS, COLUMNS, COUNT, PEDESTRIAN, ROWS, labelled_boxes, places
+from tests.detection.anchor_scenes import (
+    ANCHORS,
+    CAR,
+    COLUMNS,
+    COUNT,
+    CYCLIST,
+    PEDESTRIAN,
+    ROWS,
+    labelled_boxes,
+    places,
+)
+
+# Cells of 1 m with centers at 0, 1, ..., 8 m.
+SQUARE = make_anchors(np.arange(9.0), np.arange(9.0), KITTI_CLASSES)
+ROUNDING = 1e-6
 
 
-def assign(*labelled: tuple[int, list[float]]) -> Targets:
+def assign(
+    *labelled: tuple[int, list[float]], anchors: np.ndarray = ANCHORS, assigner: Assigner = "overlap"
+) -> Targets:
     boxes = np.array([box for _, box in labelled], np.float32).reshape(-1, 7)
-    return assign_targets(ANCHORS, KITTI_CLASSES, boxes, np.array([label for label, _ in labelled], np.int64))
+    labels = np.array([label for label, _ in labelled], np.int64)
+    return assign_targets(anchors, KITTI_CLASSES, boxes, labels, assigner)
 
 
-def assign_twin(boxes: np.ndarray, labels: np.ndarray) -> tuple[list[int], dict[int, int]]:
+def overlap_twin(boxes: np.ndarray, labels: np.ndarray) -> tuple[list[int], dict[int, int]]:
     """State of every anchor, and the box of each positive one: no windows, one anchor at a time."""
     overlap = aligned_bev_iou(ANCHORS.reshape(-1, 7), boxes).tolist()
     class_of = [index % COUNT // 2 for index in range(len(overlap))]
@@ -44,19 +65,69 @@ def assign_twin(boxes: np.ndarray, labels: np.ndarray) -> tuple[list[int], dict[
     return states, matches
 
 
+def candidates_twin(anchors: list[list[float]], box: list[float], label: int, count: int) -> list[int]:
+    """Of each yaw the nine nearest of all anchors of the class."""
+    chosen = []
+    for kind in (2 * label, 2 * label + 1):
+        own = range(kind, len(anchors), count)
+        chosen += sorted(own, key=lambda i: ((anchors[i][0] - box[0]) ** 2 + (anchors[i][1] - box[1]) ** 2, i))[:9]
+    return chosen
+
+
+def depth_inside(center: list[float], box: list[float]) -> float:
+    """How far a place lies inside a box seen from above, negative outside, metres."""
+    dx, dy = center[0] - box[0], center[1] - box[1]
+    along = dx * math.cos(box[6]) + dy * math.sin(box[6])
+    across = dy * math.cos(box[6]) - dx * math.sin(box[6])
+    return min(box[3] / 2 - abs(along), box[4] / 2 - abs(across))
+
+
+def atss_twin(boxes: np.ndarray, labels: np.ndarray) -> tuple[list[int], dict[int, int]]:
+    """State of every anchor of ANCHORS, and the box of each positive one."""
+    anchors = ANCHORS.reshape(-1, 7).astype(np.float64).tolist()
+    overlap = aligned_bev_iou(ANCHORS.reshape(-1, 7), boxes).tolist()
+    claims: dict[int, list[tuple[bool, float, int]]] = {}
+    for row, (box, label) in enumerate(zip(boxes.astype(np.float64).tolist(), labels.tolist(), strict=True)):
+        if label == IGNORED:
+            continue
+        candidates = candidates_twin(anchors, box, label, COUNT)
+        values = [overlap[index][row] for index in candidates]
+        floor = statistics.fmean(values) + statistics.pstdev(values)
+        for index, value in zip(candidates, values, strict=True):
+            if value == 0:
+                continue
+            if value == max(values):
+                claims.setdefault(index, []).append((True, value, row))
+                continue
+            depth = depth_inside(anchors[index], box)
+            assume(abs(value - floor) > ROUNDING and abs(depth) > ROUNDING)
+            if value > floor and depth > 0:
+                claims.setdefault(index, []).append((False, value, row))
+    matches = {index: max(rivals)[2] for index, rivals in claims.items()}
+    states = []
+    for index, row in enumerate(overlap):
+        negative_iou = KITTI_CLASSES[index % COUNT // 2].negative_iou
+        excused = any(label == IGNORED and iou >= negative_iou for label, iou in zip(labels, row, strict=True))
+        states.append(1 if index in matches else -1 if excused else 0)
+    return states, matches
+
+
 @settings(max_examples=100)
 @given(labelled_boxes())
-def test_equals_a_plain_loop_over_all_anchors(labelled: tuple[np.ndarray, np.ndarray]) -> None:
+@pytest.mark.parametrize(("assigner", "twin"), [("overlap", overlap_twin), ("atss", atss_twin)])
+def test_equals_a_plain_loop_over_all_anchors(
+    assigner: Assigner, twin: Callable[..., Any], labelled: tuple[np.ndarray, np.ndarray]
+) -> None:
     boxes, labels = labelled
-    targets = assign_targets(ANCHORS, KITTI_CLASSES, boxes, labels)
-    states, matches = assign_twin(boxes, labels)
+    targets = assign_targets(ANCHORS, KITTI_CLASSES, boxes, labels, assigner)
+    states, matches = twin(boxes, labels)
     assert targets.state.reshape(-1).tolist() == states
     assert targets.positives.tolist() == sorted(matches)
     assert targets.matched.tolist() == [matches[index] for index in sorted(matches)]
-    decoded = decode_boxes(targets.residuals, targets.directions, ANCHORS.reshape(-1, 7)[targets.positives])
-    expected = boxes[[matches[index] for index in sorted(matches)]].reshape(-1, 7)
-    np.testing.assert_allclose(decoded[:, :6], expected[:, :6], rtol=1e-5, atol=1e-5)
-    np.testing.assert_allclose(wrap_angle(decoded[:, 6] - expected[:, 6]), 0, atol=2e-6)
+    np.testing.assert_array_equal(targets.anchors, ANCHORS.reshape(-1, 7)[targets.positives])
+    decoded = decode_boxes(targets.residuals, targets.directions, targets.anchors)
+    np.testing.assert_allclose(decoded[:, :6], boxes[targets.matched, :6], rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(wrap_angle(decoded[:, 6] - boxes[targets.matched, 6]), 0, atol=2e-6)
 
 
 def test_positives_by_hand_in_the_third_zone() -> None:
@@ -79,10 +150,32 @@ def test_positives_by_hand_in_the_third_zone() -> None:
     assert targets.directions.tolist() == [1] * 6
 
 
-def test_no_boxes() -> None:
-    targets = assign()
+@pytest.mark.parametrize(("length_m", "columns"), [(1.95, {4}), (2.05, {3, 4, 5})])
+def test_adaptive_positives_by_hand(length_m: float, columns: set[int]) -> None:
+    """A short car on the center of a cell, whose neighbors overlap it enough, but stand 1 m away.
+
+    1.95 x 1.6 m within an anchor of 3.9 x 1.6: 0.5; 1 m along x it shares 1.925 x 1.6, 0.4904; 1 m along y 1.95 x 0.6,
+    0.1429; both, 0.1408. The turned anchor, 1.6 x 3.9: 0.3765, the same along y, and 0.1527 wherever x differs.
+    Mean of 0.5, 2 x 0.4904, 2 x 0.1429, 4 x 0.1408, 3 x 0.3765 and 6 x 0.1527: 0.2431, standard deviation 0.1399:
+    positive from 0.3830 within 0.975 m. With 2.05 m the neighbors' centers lie inside.
+    """
+    targets = assign((CAR, [4.0, 3.0, -1.0, length_m, 1.6, 1.56, 0.0]), anchors=SQUARE, assigner="atss")
+    assert places(targets, 1) == {(3, column, 0) for column in columns}
+    assert not (targets.state == -1).any()
+
+
+def test_fewer_cells_than_candidates() -> None:
+    few = make_anchors(np.arange(2.0), np.arange(3.0), KITTI_CLASSES)
+    targets = assign((CYCLIST, [1.0, 2.0, -0.6, 1.76, 0.6, 1.73, 0.0]), anchors=few, assigner="atss")
+    assert (2, 1, 4) in places(targets, 1)
+
+
+@pytest.mark.parametrize("assigner", ["overlap", "atss"])
+def test_no_boxes(assigner: Assigner) -> None:
+    targets = assign(assigner=assigner)
     assert targets.state.shape == (ROWS, COLUMNS, COUNT) and not targets.state.any()
-    assert targets.positives.shape == targets.directions.shape == (0,)
-    assert targets.residuals.shape == (0, 7)
-    kinds = (targets.state, targets.positives, targets.residuals, targets.directions)
-    assert [array.dtype for array in kinds] == [np.int8, np.int64, np.float32, np.int64]
+    assert targets.state.dtype == np.int8
+    shapes = [part.shape for part in (targets.positives, targets.anchors, targets.residuals, targets.matched)]
+    assert shapes == [(0,), (0, 7), (0, 7), (0,)]
+    kinds = (targets.positives, targets.anchors, targets.residuals, targets.directions, targets.matched)
+    assert [part.dtype for part in kinds] == [np.int64, np.float32, np.float32, np.int64, np.int64]

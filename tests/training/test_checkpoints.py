@@ -1,5 +1,6 @@
-"""Checkpoints of a run: two generations, and the one to go on from."""
+"""Checkpoints of a run: two generations, the one to go on from, and weights that a new run starts from."""
 
+import dataclasses
 import signal
 from pathlib import Path
 from types import SimpleNamespace
@@ -8,14 +9,20 @@ from typing import Any, cast
 import pytest
 import torch
 
-from asca_pillars.base.errors import TrainingError
+from asca_deploy import shipped
+from asca_deploy.shipped import find_checkpoint
+from asca_pillars.base import installation
+from asca_pillars.base.errors import BundleError, TrainingError
 from asca_pillars.base.schema import to_dict
+from asca_pillars.config.pillar import PillarModel
 from asca_pillars.models.build import build_model
+from asca_pillars.models.checkpoint import Checkpoint, load_checkpoint
 from asca_pillars.models.checkpoint_file import save_weights
 from asca_pillars.training.checkpoints import AtomicCheckpointIO, BestCheckpoint, checkpoint_to_resume
 from asca_pillars.training.loop import train
+from tests.helpers.saved_checkpoint import save_checkpoint
 from tests.helpers.scenes import write_dataset
-from tests.helpers.tiny_run import CONFIG
+from tests.helpers.tiny_run import CONFIG, NETWORK, with_train
 
 MODEL = CONFIG.model
 
@@ -156,3 +163,33 @@ def test_of_hidden_files_only_those_of_a_killed_run_go(tmp_path: Path) -> None:
             train(CONFIG, data, tmp_path / "run", devices="many")
         assert sorted(path.name for path in folder.iterdir()) == [".ipynb_checkpoints", ".notes"]
     assert (folder / ".ipynb_checkpoints" / "notes.ipynb").exists()
+
+
+STILL = with_train(epochs=1, learning_rate=1e-12)
+OTHER = dataclasses.replace(CONFIG, model=PillarModel(network=dataclasses.replace(NETWORK, pillar_channels=8)))
+
+
+def test_a_run_can_start_from_other_weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    data, bundle, first = write_dataset(tmp_path / "data", 3), tmp_path / "bundle", tmp_path / "first.ckpt"
+    torch.manual_seed(3)
+    other = Checkpoint(CONFIG, build_model(CONFIG.model), 7)
+    save_checkpoint(first, other)
+    bundle.mkdir()
+    first_weights = bundle / "weights.ckpt"
+    first_weights.write_bytes(first.read_bytes())
+    for module in (shipped, installation):
+        monkeypatch.setattr(module, "shipped_models", lambda: {"a_model": bundle})
+    assert [find_checkpoint(init) for init in (first, bundle, "a_model")] == [first, first_weights, first_weights]
+    found = load_checkpoint(train(STILL, data, tmp_path / "run", init=first_weights)).detector.parameters()
+    for expected, parameter in zip(other.detector.parameters(), found, strict=True):
+        torch.testing.assert_close(parameter, expected)
+    for init, error, message in (
+        (first, TrainingError, r"another network: \S+ is \(16, 9\) there and \(8, 9\) in this configuration"),
+        ("another", BundleError, "no bundle of that name ships"),
+        (data, BundleError, r"data: holds no weights\.ckpt, .* a_model has one"),
+        (tmp_path / "none.ckpt", TrainingError, "no such checkpoint"),
+    ):
+        with pytest.raises(error, match=message) as caught:
+            train(OTHER, data, tmp_path / "refused", init=find_checkpoint(init))
+        assert "\n" not in str(caught.value)
+    assert not (tmp_path / "refused").exists()  # the corrected command finds nothing in its way

@@ -1,6 +1,5 @@
 """OpenPCDet's PV-RCNN, imported from both versions of spconv: the same values after every part."""
 
-import dataclasses
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -9,9 +8,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from asca_pillars.base.errors import ConfigError, TrainingError
 from asca_pillars.config.pv_rcnn import PvRcnnModel
-from asca_pillars.config.tree import Config, load_config
+from asca_pillars.config.tree import load_config
 from asca_pillars.models.checkpoint import load_checkpoint
 from asca_pillars.models.openpcdet.import_checkpoint import published_config, read_foreign, write_imported
 from asca_pillars.models.pv_rcnn.layers import PvRcnn as OurNetwork
@@ -20,14 +18,12 @@ from tests.models.openpcdet.foreign_networks import PvRcnn, random_weights, writ
 from tests.models.openpcdet.small_pv_rcnn import (
     CONFIG,
     LAYOUTS,
-    MODEL,
     PUBLISHED_CHANNELS,
     Parts,
     assert_same_parts,
     foreign_pv_rcnn,
     in_layout,
 )
-from tests.models.pv_rcnn.tiny_pv_rcnn import NETWORK
 
 
 @pytest.fixture(scope="module")
@@ -75,28 +71,6 @@ def test_every_part_gives_what_theirs_gives(foreign: PvRcnn, tmp_path: Path) -> 
         fully_connected(head.reg_layers),
     )
     assert_same_parts(parts, ours)
-
-
-def test_what_does_not_fit_is_named(foreign: PvRcnn, tmp_path: Path) -> None:
-    state = foreign.state_dict()
-    gated = dataclasses.replace(MODEL, network=dataclasses.replace(NETWORK, gate="keypoint"))
-    for changes, config, message in (
-        (
-            {},
-            Config(name="gated", model=gated),
-            "OpenPCDet's model has no encode.gates.0.gate.weight; switch off what gated",
-        ),
-        (
-            {},
-            load_config("pv_rcnn_kitti"),
-            "lacks backbone_2d.blocks.0.10.weight, .* and 95 more; the network of --config",
-        ),
-        ({"roi_head.more": torch.zeros(1)}, CONFIG, "roi_head.more: no place for it"),
-        ({"backbone_3d.conv2.0.0.weight": torch.zeros(3, 3)}, CONFIG, r"conv2\.0\.0\.weight has shape \(3, 3\)"),
-    ):
-        weights = read_foreign(write_foreign(tmp_path / "theirs.pth", state | changes))
-        with pytest.raises((TrainingError, ConfigError), match=message):
-            write_imported(weights, config, tmp_path / "ours.ckpt")
 
 
 def test_the_published_model_fits(tmp_path: Path) -> None:

@@ -92,8 +92,3 @@ def test_the_last_point_of_a_range_is_in_its_last_voxel(count: int, size_m: floa
 def test_impossible_grids_are_refused(change: dict[str, object], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         VoxelGrid(**change)  # type: ignore[arg-type]
-
-
-def test_a_map_of_another_shape_is_refused() -> None:
-    with pytest.raises(ValueError, match="shape"):
-        voxelize(np.zeros((1, 4), np.float32), GRID, CellMap((1, 2, 3)))

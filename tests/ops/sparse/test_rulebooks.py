@@ -81,9 +81,3 @@ def test_places_of_an_upsampling(seed: int, share: float, halvings: int) -> None
 def test_lattices_that_do_not_fit_are_refused(shape: Shape, message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         CellMap(shape)
-
-
-@pytest.mark.parametrize("padding", [-1, 3])
-def test_impossible_convolutions_are_refused(padding: int) -> None:
-    with pytest.raises(ConfigError, match="padding"):
-        map_convolution(3, padding=padding)
