@@ -140,10 +140,6 @@ def _ball_query(
 
 
 _KERNELS = SimpleNamespace(
-    sort_points=_sort_points,
-    fill_pillars=_fill_pillars,
-    nms=_nms,
-    sort=_sort,
-    ball_query=_ball_query,
+    sort_points=_sort_points, fill_pillars=_fill_pillars, nms=_nms, sort=_sort, ball_query=_ball_query
 )
 _USERS = "detection.decode", "ops.pillar.prepare", "ops.points.sampling", "ops.points.neighbors"

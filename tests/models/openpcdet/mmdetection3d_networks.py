@@ -7,7 +7,14 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from tests.models.openpcdet.foreign_networks import AnchorHead, PillarLayer, SparseLayer, foreground
+from tests.models.openpcdet.foreign_networks import (
+    AnchorHead,
+    PillarLayer,
+    SparseLayer,
+    foreground,
+    map_features,
+    map_layers,
+)
 
 
 def write_mmdetection3d(path: Path, state: dict[str, Tensor], **meta: Any) -> Path:
@@ -29,43 +36,21 @@ class ConvModule(nn.Module):
         return torch.relu(self.bn(self.conv(features)))
 
 
-class Backbone2d(nn.Module):
-    """SECOND."""
+class MapDetector(nn.Module):
+    """SECOND and SECONDFPN, blocks and upsamplings of one neck in modules of their own."""
 
-    def __init__(self, channels: int, widths: Sequence[int], convs: Sequence[int], strides: Sequence[int]) -> None:
+    backbone: Any
+    neck: Any
+
+    def __init__(
+        self, channels: int, widths: Sequence[int], convs: Sequence[int], strides: Sequence[int], up: int
+    ) -> None:
         super().__init__()
-        self.blocks = nn.ModuleList()
-        for width, count, stride in zip(widths, convs, strides, strict=True):
-            layers: list[nn.Module] = []
-            for number in range(count + 1):
-                step = stride if number == 0 else 1
-                layers.append(nn.Conv2d(width if number else channels, width, 3, step, padding=1, bias=False))
-                layers += [nn.BatchNorm2d(width, eps=1e-3), nn.ReLU()]
-            self.blocks.append(nn.Sequential(*layers))
-            channels = width
+        self.backbone, self.neck = nn.Module(), nn.Module()
+        self.backbone.blocks, self.neck.deblocks = map_layers(channels, widths, convs, strides, up, pad_first=False)
 
-    def forward(self, features: Tensor) -> list[Tensor]:
-        maps = []
-        for block in self.blocks:
-            features = block(features)
-            maps.append(features)
-        return maps
-
-
-class Neck(nn.Module):
-    """SECONDFPN."""
-
-    def __init__(self, widths: Sequence[int], up: int, strides: Sequence[int]) -> None:
-        super().__init__()
-        self.deblocks = nn.ModuleList(
-            nn.Sequential(
-                nn.ConvTranspose2d(width, up, step, step, bias=False), nn.BatchNorm2d(up, eps=1e-3), nn.ReLU()
-            )
-            for width, step in zip(widths, strides, strict=True)
-        )
-
-    def forward(self, maps: list[Tensor]) -> Tensor:
-        return torch.cat([deblock(each) for deblock, each in zip(self.deblocks, maps, strict=True)], dim=1)
+    def above(self, canvas: Tensor) -> Tensor:
+        return map_features(self.backbone.blocks, self.neck.deblocks, canvas)
 
 
 class Anchor3DHead(AnchorHead):
@@ -74,17 +59,15 @@ class Anchor3DHead(AnchorHead):
     BOXES = "conv_reg"
 
 
-class PointPillars(nn.Module):
+class PointPillars(MapDetector):
     """PillarFeatureNet, SECOND, SECONDFPN and Anchor3DHead."""
 
     voxel_encoder: Any
 
     def __init__(self, channels: int, widths: Sequence[int], convs: Sequence[int], up: int, classes: int) -> None:
-        super().__init__()
+        super().__init__(channels, widths, convs, (2, 2, 2), up)
         self.voxel_encoder = nn.Module()
         self.voxel_encoder.pfn_layers = nn.ModuleList([PillarLayer(channels)])
-        self.backbone = Backbone2d(channels, widths, convs, (2, 2, 2))
-        self.neck = Neck(widths, up, (1, 2, 4))
         self.bbox_head = Anchor3DHead(3 * up, 2 * classes, classes)
 
 
@@ -107,7 +90,7 @@ def fully_connected(channels: int, hidden: int, out: int | None) -> nn.Sequentia
     return nn.Sequential(*layers, *([] if out is None else [nn.Conv2d(hidden, out, 1)]))
 
 
-class PvRcnn(nn.Module):
+class PvRcnn(MapDetector):
     """SparseEncoder, SECOND, SECONDFPN, PartA2RPNHead, VoxelSetAbstraction and PVRCNNRoiHead.
 
     Args:
@@ -134,7 +117,7 @@ class PvRcnn(nn.Module):
         weighting: int,
         grid: tuple[int, int, Sequence[int], int],
     ) -> None:
-        super().__init__()
+        super().__init__(2 * widths[4], neck[0], neck[1], (1, 2), neck[2])
         self.middle_encoder = nn.Module()
         self.middle_encoder.conv_input = SparseLayer(4, widths[0], (3, 3, 3))
         self.middle_encoder.encoder_layers = nn.Module()
@@ -143,8 +126,6 @@ class PvRcnn(nn.Module):
             layers = nn.Sequential(*(SparseLayer(read, widths[stage], (3, 3, 3)) for read in reads))
             setattr(self.middle_encoder.encoder_layers, f"encoder_layer{stage + 1}", layers)
         self.middle_encoder.conv_out = SparseLayer(widths[3], widths[4], (3, 1, 1))
-        self.backbone = Backbone2d(2 * widths[4], neck[0], neck[1], (1, 2))
-        self.neck = Neck(neck[0], neck[2], (1, 2))
         self.rpn_head = Anchor3DHead(2 * neck[2], 2 * classes, classes)
         self.points_encoder = nn.Module()
         self.points_encoder.rawpoints_sa_layer, *others = (set_abstraction(*each) for each in balls)

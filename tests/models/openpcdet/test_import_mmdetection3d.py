@@ -45,7 +45,7 @@ NOT_LEGACY = "model = dict(voxel_encoder=dict(type='PillarFeatureNet', legacy=Fa
 @pytest.fixture(scope="module")
 def foreign() -> PointPillars:
     network = PointPillars(12, NETWORK.block_channels, NETWORK.block_convs, 8, len(SPEC.classes))
-    assert isinstance(random_weights(network), PointPillars)
+    assert isinstance(random_weights(network, seed=1), PointPillars)
     return network
 
 
@@ -64,7 +64,7 @@ def test_every_part_gives_what_theirs_gives(foreign: PointPillars, tmp_path: Pat
     assert_same_parts(
         checkpoint.detector,
         lambda pillars: layer(padded(pillars, legacy=legacy)),
-        lambda canvas: foreign.neck(foreign.backbone(canvas)),
+        foreign.above,
         foreign.bbox_head,
     )
 
@@ -120,7 +120,7 @@ def test_every_part_of_pv_rcnn_gives_what_theirs_gives(tmp_path: Path) -> None:
     head = roi.bbox_head
     parts = Parts(
         [[encoder.conv_input, *stages[0]], *map(list, stages[1:]), [encoder.conv_out]],
-        lambda seen: theirs.neck(theirs.backbone(seen)),
+        theirs.above,
         theirs.rpn_head,
         [list(layer.mlps) for layer in (points.rawpoints_sa_layer, *points.voxel_sa_layers)],
         convolved(points.point_feature_fusion_layer),

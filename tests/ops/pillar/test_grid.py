@@ -50,10 +50,7 @@ def test_depths_follow_equations_1_to_5(grid: PillarGrid) -> None:
 
 @given(grids())
 def test_ranges_are_filled_exactly(grid: PillarGrid) -> None:
-    for edges, span, count in (
-        (grid.x_edges_m, grid.x_range_m, grid.nx),
-        (grid.y_edges_m, grid.y_range_m, grid.ny),
-    ):
+    for edges, span, count in ((grid.x_edges_m, grid.x_range_m, grid.nx), (grid.y_edges_m, grid.y_range_m, grid.ny)):
         assert edges.shape == (count + 1,) and edges.dtype == np.float64
         assert (edges[0], edges[-1]) == span
         assert (np.diff(edges) > 0).all()
@@ -140,12 +137,7 @@ def test_illegal_grids_are_refused_with_advice(settings: dict[str, object], name
         assert text in message
 
 
-@given(
-    st.sampled_from([0.0, -20.0, 3.5]) | st.none(),
-    st.floats(1, 120),
-    st.floats(0.05, 0.6),
-    st.integers(1, 5),
-)
+@given(st.sampled_from([0.0, -20.0, 3.5]) | st.none(), st.floats(1, 120), st.floats(0.05, 0.6), st.integers(1, 5))
 def test_advice_on_x_works(start_m: float | None, length_m: float, v_max_m: float, zones: int) -> None:
     span = (-length_m / 2, length_m / 2) if start_m is None else (start_m, start_m + length_m)
     try:

@@ -6,7 +6,6 @@ from numpy.typing import NDArray
 
 from asca_pillars.base.errors import ConfigError
 from asca_pillars.detection.proposals import ProposalSettings
-from asca_pillars.geometry.overlap import bev_iou
 from asca_pillars.ops.two_stage.first_stage import (
     FirstStageOutputs,
     FirstStageSettings,
@@ -15,17 +14,6 @@ from asca_pillars.ops.two_stage.first_stage import (
 )
 from tests.helpers.scenes import SPEC, make_scene
 from tests.models.two_stage.random_stage import CHANNELS, SETTINGS, RandomStage
-
-
-def test_quotas_and_suppression() -> None:
-    found = run_first_stage(RandomStage(), make_scene(0)[0], SETTINGS).proposals
-    settings = SETTINGS.proposals
-    assert np.bincount(found.labels).tolist() == list(settings.quotas), "noise fills every quota"
-    assert found.scores.min() >= settings.score_threshold
-    assert found.scores.min() < SPEC.classes[0].score_threshold, "the detector's own threshold does not count"
-    for label in range(3):
-        boxes = found.boxes[found.labels == label]
-        assert np.triu(bev_iou(boxes, boxes), 1).max() <= settings.nms_iou
 
 
 def test_keypoints_are_points_near_proposals_with_the_map_below_them() -> None:
