@@ -164,6 +164,22 @@ def test_adaptive_positives_by_hand(length_m: float, columns: set[int]) -> None:
     assert not (targets.state == -1).any()
 
 
+def test_an_anchor_of_two_boxes_goes_to_the_one_whose_best_it_is() -> None:
+    """A car of the anchor's size would also have the next column, which it overlaps by 2.9 / 4.9 = 0.59.
+
+    A narrow one, 3.0 x 1.0 m, lies within that anchor, 3 / 6.24 = 0.48, and within no other: it is its own. A short one
+    on the car's own center has nothing better either, but overlaps it less.
+    """
+    fitting = [4.0, 3.0, -1.0, 3.9, 1.6, 1.56, 0.0]
+    narrow, short = [5.4, 3.0, -1.0, 3.0, 1.0, 1.56, 0.0], [4.0, 3.1, -1.0, 2.0, 1.6, 1.56, 0.0]
+    for other, column, winner in ((narrow, 5, narrow), (short, 4, fitting)):
+        for order in ([fitting, other], [other, fitting]):
+            targets = assign(*((CAR, box) for box in order), anchors=SQUARE, assigner="atss")
+            taken = dict(zip(targets.positives.tolist(), targets.matched.tolist(), strict=True))
+            assert taken[(3 * 9 + column) * COUNT] == order.index(winner)
+            assert taken[(3 * 9 + 3) * COUNT] == order.index(fitting)
+
+
 def test_fewer_cells_than_candidates() -> None:
     few = make_anchors(np.arange(2.0), np.arange(3.0), KITTI_CLASSES)
     targets = assign((CYCLIST, [1.0, 2.0, -0.6, 1.76, 0.6, 1.73, 0.0]), anchors=few, assigner="atss")

@@ -74,8 +74,8 @@ def test_points_near_boxes(seed: int, count: int, margin_m: float, offset_m: flo
 def test_points_near_circles_of_any_size() -> None:
     """Cells that a circle covers, reaches or leaves out, and points on their borders."""
     points = (np.random.default_rng(0).integers(-400, 400, (20000, 4)) / 8).astype(np.float32)
-    sizes = [0.01, 0.5, 3.0, 40.0]
-    boxes = np.array([[x, 10 - x, 0, size, size, 1, 0] for x, size in zip((-30, 20, 3, 5), sizes, strict=True)])
+    sizes = [(0.01, 0.01), (0.75, 1.0), (3.0, 4.0), (48.0, 64.0)]  # of all but the first the radius is whole eighths
+    boxes = np.array([[x, 10 - x, 0, *size, 1, 0] for x, size in zip((-30, 20, 3, 5), sizes, strict=True)])
     for some in (boxes[:2], boxes[1:3], boxes):
         found = points_near_boxes(points, some, 0.25)
         assert 0 < len(found) < len(points)
