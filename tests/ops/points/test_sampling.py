@@ -76,6 +76,7 @@ def test_points_near_circles_of_any_size() -> None:
     points = (np.random.default_rng(0).integers(-400, 400, (20000, 4)) / 8).astype(np.float32)
     sizes = [(0.01, 0.01), (0.75, 1.0), (3.0, 4.0), (48.0, 64.0)]  # of all but the first the radius is whole eighths
     boxes = np.array([[x, 10 - x, 0, *size, 1, 0] for x, size in zip((-30, 20, 3, 5), sizes, strict=True)])
+    points[:4, :2] = boxes[:, :2] + np.stack([np.hypot(*np.array(sizes).T) / 2 + 0.25, np.zeros(4)], axis=1)
     for some in (boxes[:2], boxes[1:3], boxes):
         found = points_near_boxes(points, some, 0.25)
         assert 0 < len(found) < len(points)
