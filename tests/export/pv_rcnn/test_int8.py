@@ -19,6 +19,7 @@ from asca_deploy.pv_rcnn.graphs import OUT, voxel_inputs
 from asca_deploy.pv_rcnn.pipeline import PvRcnnPipeline
 from asca_export import graphs, int8
 from asca_export.bundle_writer import ExportOptions
+from asca_export.int8 import logit_error
 from asca_export.pv_rcnn.export import export_pv_rcnn_bundle
 from asca_export.pv_rcnn.int8 import quantize_pv_rcnn_bundle
 from asca_export.pv_rcnn.voxel_forms import VoxelProducts, VoxelSample, scale_voxels_to_steps
@@ -28,7 +29,7 @@ from asca_pillars.models.pv_rcnn.network import PvRcnnDetector
 from tests.export.pv_rcnn.random_checkpoint import CALIBRATION, random_checkpoint
 from tests.export.tiny import SCANS
 from tests.helpers.made_once import made_once
-from tests.models.pv_rcnn.tiny_pv_rcnn import MODEL, NETWORK, batch, frame, tiny_config, tiny_detector
+from tests.models.pv_rcnn.tiny_pv_rcnn import MODEL, NETWORK, SPEC, batch, frame, tiny_config, tiny_detector
 
 LAYERS = 11 + 2 * 2 + 2 + 1
 """Of 12 products over voxels all but the first; the two blocks, their upsamplings, the head."""
@@ -72,6 +73,18 @@ def test_the_bundle_says_what_it_is(folders: tuple[Path, Path]) -> None:
     assert report.boxes > 20
     assert report.boxes_matched > 0.6 * report.boxes, "proposals of random weights have almost equal scores"
     assert Detector(folders[1]).runs_on == "cpu int8"
+
+
+def test_its_report_by_both_bundles(folders: tuple[Path, Path]) -> None:
+    (exact, floating), (_, eight_bit) = (opened(folder) for folder in folders)
+    scores = []
+    for pipeline in (floating, eight_bit):
+        maps = [pipeline.infer(pipeline.prepare(points, []), []).maps for points in SCANS]
+        scores.append([each.scores for each in maps if each is not None])
+    report = load_bundle(folders[1]).quantization
+    assert report is not None
+    assert logit_error(scores[0], iter(scores[1]), SPEC) == pytest.approx(report.logit_rms_error, rel=1e-3)
+    assert sum(len(exact(points)) for points in SCANS) == report.boxes
 
 
 def test_graphs_multiply_in_8_bits_and_the_second_stage_does_not(folders: tuple[Path, Path]) -> None:

@@ -71,7 +71,10 @@ def test_cells_of_a_cube() -> None:
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
 def test_what_has_no_place_is_refused(bad: float) -> None:
     place, nowhere = np.zeros((1, 3)), np.array([[0, bad, 0]])
-    for find in (lambda *_: ball_query(*_, 0.8, 3), three_nearest, lambda *_: nearest_in_cubes(*_, 0.8, 3)):
-        for given_points in ((nowhere, place), (place, nowhere)):
-            with pytest.raises(ValueError, match="finite"):
-                find(*given_points)
+    for points, queries in ((nowhere, place), (place, nowhere)):
+        with pytest.raises(ValueError, match="finite"):
+            ball_query(points, queries, 0.8, 3)
+        with pytest.raises(ValueError, match="finite"):
+            three_nearest(points, queries)
+        with pytest.raises(ValueError, match="finite"):
+            nearest_in_cubes(points, queries, 0.8, 3)
