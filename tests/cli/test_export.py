@@ -15,8 +15,7 @@ from asca_pillars.models.checkpoint import load_checkpoint
 from asca_pillars.models.checkpoint_file import weights_sha256
 from asca_pillars.ops.pillar.grid import PillarGrid
 from asca_pillars.scans.scan_reader import write_scan
-from tests.export.tiny import SCANS, tiny_checkpoint
-from tests.export.tiny_sparse import sparse_checkpoint
+from tests.export.tiny import SCANS, sparse_checkpoint, tiny_checkpoint
 from tests.helpers.in_process import invoke, run_here
 from tests.helpers.saved_checkpoint import save_checkpoint
 from tests.helpers.scenes import SPEC

@@ -47,17 +47,6 @@ def test_crowds(seed: int, share: float) -> None:
         np.testing.assert_allclose(overlap[row[held], held].sum(), best, atol=1e-9)
 
 
-def test_a_new_detection_passes_objects_along_a_chain() -> None:
-    """The third takes object 0 from the first, which takes object 1 from the second, which takes object 2."""
-    overlap = np.array([[0.9, 0.8, 0], [0, 0.9, 0.8], [0.9, 0, 0]])
-    assert best_assignments(overlap).tolist() == [
-        [UNMATCHED, UNMATCHED, UNMATCHED],
-        [0, UNMATCHED, UNMATCHED],
-        [0, 1, UNMATCHED],
-        [2, 0, 1],
-    ]
-
-
 def test_a_better_detection_leaves_the_worse_one_without() -> None:
     assert best_assignments(np.array([[0.6], [0.9], [0.7]])).tolist() == [[UNMATCHED], [0], [1], [1]]
     assert best_assignments(np.empty((2, 0))).shape == (3, 0)

@@ -1,4 +1,4 @@
-"""`decode` against a plain loop over anchors, and head maps that hold nothing or nonsense."""
+"""`decode` against a plain loop over anchors, suppression against its definition, and maps of nothing or nonsense."""
 
 import dataclasses
 import math
@@ -10,10 +10,11 @@ from hypothesis import strategies as st
 
 from asca_pillars.base.errors import ConfigError
 from asca_pillars.detection.anchors import KITTI_CLASSES, make_anchors
-from asca_pillars.detection.decode import HeadMaps, PostProcess, decode
+from asca_pillars.detection.decode import HeadMaps, PostProcess, decode, rotated_nms
 from asca_pillars.geometry.boxes import decode_boxes, encode_boxes
 from asca_pillars.geometry.overlap import bev_iou
 from asca_pillars.ops.pillar.grid import PillarGrid
+from tests.geometry.overlap_oracles import bev_iou_twin, random_boxes
 
 GRID = PillarGrid(x_range_m=(2.0, 17.36), y_range_m=(-3.2, 7.04), z_range_m=(-2.5, 1.5))
 CLASSES = tuple(
@@ -98,39 +99,8 @@ def test_equals_a_plain_loop(
     np.testing.assert_allclose(detections.scores, [1 / (1 + math.exp(-x)) for x, _, _ in expected], rtol=1e-6)
     np.testing.assert_array_equal(detections.boxes, np.reshape([box for _, _, box in expected], (-1, 7)))
     assert detections.class_names == NAMES
-
-
-def test_boxes_come_back_from_the_maps() -> None:
-    maps = quiet_maps()
-    car = np.array([9.1, 3.3, -0.9, 4.2, 1.7, 1.5, 2.8], np.float32)
-    cyclist = np.array([4.0, -1.0, -0.5, 1.8, 0.5, 1.7, -1.4], np.float32)
-    write(maps, 1, 20, 12, car, 2.0)  # a car's 90 degree anchor
-    write(maps, 4, 7, 3, cyclist, 3.0)
-    detections = decode(maps, ANCHORS, CLASSES, PostProcess())
-    np.testing.assert_allclose(detections.boxes, [cyclist, car], atol=1e-5)
-    np.testing.assert_allclose(detections.scores, 1 / (1 + np.exp([-3.0, -2.0])), rtol=1e-6)
-    assert detections.names == ["Cyclist", "Car"]
-    assert (detections.boxes.dtype, detections.scores.dtype, detections.labels.dtype) == (
-        np.float32,
-        np.float32,
-        np.int64,
-    )
-
-
-def test_suppression_keeps_classes_apart() -> None:
-    maps = quiet_maps()
-    box = np.array([9.0, 3.0, -0.8, 1.9, 0.7, 1.7, 0.1], np.float32)
-    for anchor, logit in ((2, 1.0), (3, 2.0), (4, 1.5)):  # pedestrian twice, cyclist
-        write(maps, anchor, 19, 12, box, logit)
-    assert decode(maps, ANCHORS, CLASSES, PostProcess()).names == ["Pedestrian", "Cyclist"]
-
-
-def test_each_class_has_its_threshold() -> None:
-    maps = quiet_maps()
-    for label in range(3):
-        # A score of 0.35: enough for a pedestrian alone.
-        write(maps, 2 * label, 5, 10 * label, ANCHORS[5, 10 * label, 2 * label], math.log(0.35 / 0.65))
-    assert decode(maps, ANCHORS, CLASSES, PostProcess()).names == ["Pedestrian"]
+    kinds = (detections.boxes.dtype, detections.scores.dtype, detections.labels.dtype)
+    assert kinds == (np.float32, np.float32, np.int64)
 
 
 @pytest.mark.parametrize(("threshold", "reported"), [(0.0, 100), (1.0, 0)])
@@ -145,12 +115,6 @@ def test_cells_that_a_masked_neck_never_looks_at_are_not_reported_at_threshold_z
     maps.scores[:] = -1e4
     write(maps, 0, 5, 10, ANCHORS[5, 10, 0], -20.0)
     assert len(decode(maps, ANCHORS, classes, PostProcess())) == 1
-
-
-def test_nothing_found() -> None:
-    detections = decode(quiet_maps(), ANCHORS, CLASSES, PostProcess())
-    assert len(detections) == 0 and detections.boxes.shape == (0, 7)
-    assert detections.class_names == NAMES and detections.labels.dtype == np.int64
 
 
 def test_numbers_that_overflowed_give_no_boxes() -> None:
@@ -179,15 +143,6 @@ def test_scores_do_not_overflow() -> None:
     assert scores[0] == 1 and (scores[1:] == 0).all()
 
 
-def test_maps_of_another_model_are_refused() -> None:
-    maps = quiet_maps()
-    swapped = HeadMaps(*(m.transpose(0, 2, 1) for m in maps))
-    with pytest.raises(ValueError, match=r"\(6, 32, 56\).*not.*\(6, 56, 32\)"):
-        decode(swapped, ANCHORS, CLASSES, PostProcess())
-    with pytest.raises(ValueError, match="2 classes"):
-        decode(maps, ANCHORS, CLASSES[:2], PostProcess())
-
-
 @pytest.mark.parametrize("settings", [{"nms_iou": -0.1}, {"nms_iou": 1.1}, {"candidates": 0}, {"max_detections": 0}])
 def test_impossible_settings_are_refused(settings: dict[str, float]) -> None:
     with pytest.raises(ConfigError, match=next(iter(settings))):
@@ -211,3 +166,35 @@ def test_rows_of_active_cells_decode_as_maps_in_which_the_others_say_no(seed: in
     np.testing.assert_array_equal(found.labels, expected.labels)
     with pytest.raises(ValueError, match="must have shapes"):
         decode(rows, ANCHORS, CLASSES, PostProcess(), np.arange(len(cells) + 1))
+
+
+def nms_twin(boxes: np.ndarray, scores: np.ndarray, threshold: float) -> list[int]:
+    """The definition: walk down the scores, keep what no kept box overlaps too much; by shapely if they may meet."""
+    reach = np.hypot(boxes[:, 3], boxes[:, 4]) / 2
+    kept: list[int] = []
+    for index in sorted(range(len(boxes)), key=lambda i: -scores[i]):
+        apart = np.hypot(*(boxes[kept, :2] - boxes[index, :2]).T)
+        near = np.flatnonzero(apart < reach[kept] + reach[index])
+        if all(bev_iou_twin(boxes[index], boxes[kept[other]]) <= threshold for other in near):
+            kept.append(index)
+    return kept
+
+
+@settings(max_examples=30)
+@given(
+    st.integers(0, 2**32 - 1),
+    st.integers(0, 150),
+    st.sampled_from([2.0, 10.0, 40.0]),
+    st.sampled_from([0.01, 0.2, 0.5, 0.8]),
+    st.booleans(),
+)
+def test_suppression_equals_its_definition(
+    seed: int, count: int, spread_m: float, threshold: float, ties: bool
+) -> None:
+    boxes = random_boxes(seed, count, spread_m).astype(np.float64)
+    scores = np.random.default_rng(seed).normal(size=count)
+    if ties:
+        scores = np.round(scores)
+    kept = rotated_nms(boxes, scores, threshold)
+    assert kept.dtype == np.int64
+    assert kept.tolist() == nms_twin(boxes, scores, threshold)

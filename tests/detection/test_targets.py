@@ -1,14 +1,16 @@
-"""Target assignment against a plain loop over all anchors, and by hand on a grid of three zones."""
+"""Both assignments of targets against plain loops over all anchors, and by hand."""
 
-import dataclasses
 import math
+import statistics
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 
-from asca_pillars.detection.anchors import IGNORED, KITTI_CLASSES
-from asca_pillars.detection.targets import Targets, assign_targets
+from asca_pillars.detection.anchors import IGNORED, KITTI_CLASSES, make_anchors
+from asca_pillars.detection.targets import Assigner, Targets, assign_targets
 from asca_pillars.geometry.boxes import decode_boxes, wrap_angle
 from asca_pillars.geometry.overlap import aligned_bev_iou
 from tests.detection.anchor_scenes import (
@@ -19,24 +21,24 @@ from tests.detection.anchor_scenes import (
     CYCLIST,
     PEDESTRIAN,
     ROWS,
-    SIZES,
     labelled_boxes,
     places,
 )
 
+# Cells of 1 m with centers at 0, 1, ..., 8 m.
+SQUARE = make_anchors(np.arange(9.0), np.arange(9.0), KITTI_CLASSES)
+ROUNDING = 1e-6
 
-def assign(*labelled: tuple[int, list[float]]) -> Targets:
+
+def assign(
+    *labelled: tuple[int, list[float]], anchors: np.ndarray = ANCHORS, assigner: Assigner = "overlap"
+) -> Targets:
     boxes = np.array([box for _, box in labelled], np.float32).reshape(-1, 7)
-    return assign_targets(ANCHORS, KITTI_CLASSES, boxes, np.array([label for label, _ in labelled], np.int64))
+    labels = np.array([label for label, _ in labelled], np.int64)
+    return assign_targets(anchors, KITTI_CLASSES, boxes, labels, assigner)
 
 
-def box_at(row: int, column: int, label: int = PEDESTRIAN, dx: float = 0.0, yaw: float = 0.0) -> list[float]:
-    """A box of its class's anchor size, `dx` beside the center of a head cell."""
-    x, y = ANCHORS[row, column, 0, :2]
-    return [x + dx, y, -0.9, *SIZES[label], yaw]
-
-
-def assign_twin(boxes: np.ndarray, labels: np.ndarray) -> tuple[list[int], dict[int, int]]:
+def overlap_twin(boxes: np.ndarray, labels: np.ndarray) -> tuple[list[int], dict[int, int]]:
     """State of every anchor, and the box of each positive one: no windows, one anchor at a time."""
     overlap = aligned_bev_iou(ANCHORS.reshape(-1, 7), boxes).tolist()
     class_of = [index % COUNT // 2 for index in range(len(overlap))]
@@ -63,19 +65,69 @@ def assign_twin(boxes: np.ndarray, labels: np.ndarray) -> tuple[list[int], dict[
     return states, matches
 
 
-@settings(max_examples=40)
+def candidates_twin(anchors: list[list[float]], box: list[float], label: int, count: int) -> list[int]:
+    """Of each yaw the nine nearest of all anchors of the class."""
+    chosen = []
+    for kind in (2 * label, 2 * label + 1):
+        own = range(kind, len(anchors), count)
+        chosen += sorted(own, key=lambda i: ((anchors[i][0] - box[0]) ** 2 + (anchors[i][1] - box[1]) ** 2, i))[:9]
+    return chosen
+
+
+def depth_inside(center: list[float], box: list[float]) -> float:
+    """How far a place lies inside a box seen from above, negative outside, metres."""
+    dx, dy = center[0] - box[0], center[1] - box[1]
+    along = dx * math.cos(box[6]) + dy * math.sin(box[6])
+    across = dy * math.cos(box[6]) - dx * math.sin(box[6])
+    return min(box[3] / 2 - abs(along), box[4] / 2 - abs(across))
+
+
+def atss_twin(boxes: np.ndarray, labels: np.ndarray) -> tuple[list[int], dict[int, int]]:
+    """State of every anchor of ANCHORS, and the box of each positive one."""
+    anchors = ANCHORS.reshape(-1, 7).astype(np.float64).tolist()
+    overlap = aligned_bev_iou(ANCHORS.reshape(-1, 7), boxes).tolist()
+    claims: dict[int, list[tuple[bool, float, int]]] = {}
+    for row, (box, label) in enumerate(zip(boxes.astype(np.float64).tolist(), labels.tolist(), strict=True)):
+        if label == IGNORED:
+            continue
+        candidates = candidates_twin(anchors, box, label, COUNT)
+        values = [overlap[index][row] for index in candidates]
+        floor = statistics.fmean(values) + statistics.pstdev(values)
+        for index, value in zip(candidates, values, strict=True):
+            if value == 0:
+                continue
+            if value == max(values):
+                claims.setdefault(index, []).append((True, value, row))
+                continue
+            depth = depth_inside(anchors[index], box)
+            assume(abs(value - floor) > ROUNDING and abs(depth) > ROUNDING)
+            if value > floor and depth > 0:
+                claims.setdefault(index, []).append((False, value, row))
+    matches = {index: max(rivals)[2] for index, rivals in claims.items()}
+    states = []
+    for index, row in enumerate(overlap):
+        negative_iou = KITTI_CLASSES[index % COUNT // 2].negative_iou
+        excused = any(label == IGNORED and iou >= negative_iou for label, iou in zip(labels, row, strict=True))
+        states.append(1 if index in matches else -1 if excused else 0)
+    return states, matches
+
+
+@settings(max_examples=100)
 @given(labelled_boxes())
-def test_equals_a_plain_loop_over_all_anchors(labelled: tuple[np.ndarray, np.ndarray]) -> None:
+@pytest.mark.parametrize(("assigner", "twin"), [("overlap", overlap_twin), ("atss", atss_twin)])
+def test_equals_a_plain_loop_over_all_anchors(
+    assigner: Assigner, twin: Callable[..., Any], labelled: tuple[np.ndarray, np.ndarray]
+) -> None:
     boxes, labels = labelled
-    targets = assign_targets(ANCHORS, KITTI_CLASSES, boxes, labels)
-    states, matches = assign_twin(boxes, labels)
+    targets = assign_targets(ANCHORS, KITTI_CLASSES, boxes, labels, assigner)
+    states, matches = twin(boxes, labels)
     assert targets.state.reshape(-1).tolist() == states
     assert targets.positives.tolist() == sorted(matches)
     assert targets.matched.tolist() == [matches[index] for index in sorted(matches)]
-    decoded = decode_boxes(targets.residuals, targets.directions, ANCHORS.reshape(-1, 7)[targets.positives])
-    expected = boxes[[matches[index] for index in sorted(matches)]].reshape(-1, 7)
-    np.testing.assert_allclose(decoded[:, :6], expected[:, :6], rtol=1e-5, atol=1e-5)
-    np.testing.assert_allclose(wrap_angle(decoded[:, 6] - expected[:, 6]), 0, atol=2e-6)
+    np.testing.assert_array_equal(targets.anchors, ANCHORS.reshape(-1, 7)[targets.positives])
+    decoded = decode_boxes(targets.residuals, targets.directions, targets.anchors)
+    np.testing.assert_allclose(decoded[:, :6], boxes[targets.matched, :6], rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(wrap_angle(decoded[:, 6] - boxes[targets.matched, 6]), 0, atol=2e-6)
 
 
 def test_positives_by_hand_in_the_third_zone() -> None:
@@ -98,102 +150,48 @@ def test_positives_by_hand_in_the_third_zone() -> None:
     assert targets.directions.tolist() == [1] * 6
 
 
-def test_positives_by_hand_where_cells_are_coarse() -> None:
-    """As above in the first zone, whose cells are 0.64 m apart along x: (0.8 - 0.64) / 1.44 = 0.11."""
-    targets = assign((PEDESTRIAN, [2.0 + 2.5 * 0.64, 1.12, -0.9, 0.8, 0.6, 1.73, math.pi / 2]))
-    assert places(targets, 1) == {(9, 2, 2), (9, 2, 3)}
-    # Turned by 90 degrees it is 0.8 m along y: 0.48 / 1.12 = 0.43 one row further.
-    assert places(targets, -1) == {(8, 2, 3), (10, 2, 3)}
-    assert targets.directions.tolist() == [0, 0]
+@pytest.mark.parametrize(("length_m", "columns"), [(1.95, {4}), (2.05, {3, 4, 5})])
+def test_adaptive_positives_by_hand(length_m: float, columns: set[int]) -> None:
+    """A short car on the center of a cell, whose neighbors overlap it enough, but stand 1 m away.
 
-
-def test_a_box_that_fits_no_anchor_well_gets_its_best_one() -> None:
-    """0.30 m beside an anchor: 0.5 / 1.1 = 0.455 < positive_iou; 0.34 m from the next one: 0.46 / 1.14 = 0.404."""
-    targets = assign((PEDESTRIAN, box_at(9, 2, dx=0.30)))
-    assert places(targets, 1) == {(9, 2, 2)}
-    assert places(targets, -1) == {(9, 3, 2)}
-    np.testing.assert_allclose(targets.residuals[0, 0], 0.30 / math.hypot(0.8, 0.6), rtol=1e-5)
-
-
-def test_every_box_is_to_be_found() -> None:
-    """A box far too long for any anchor, and a perfect one."""
-    long_box = box_at(4, 8, CYCLIST)
-    long_box[3] = 5.6  # 1.76 / 5.6 = 0.31: below negative_iou everywhere
-    targets = assign((CYCLIST, long_box), (CYCLIST, box_at(12, 8, CYCLIST)))
-    found = decode_boxes(targets.residuals, targets.directions, ANCHORS.reshape(-1, 7)[targets.positives])
-    assert {round(float(y), 2) for y in found[:, 1]} == {round(float(ANCHORS[row, 0, 0, 1]), 2) for row in (4, 12)}
-
-
-def test_ignored_boxes_excuse_what_they_cover_for_every_class() -> None:
-    targets = assign((IGNORED, box_at(9, 8)))
-    assert not len(targets.positives) and not places(targets, 1)
-    # Cells are 0.32 m apart. A cyclist's anchor that covers the box: 0.48 / 1.056 = 0.4545 >= 0.35, up to
-    # (1.76 - 0.8) / 2 = 0.48 m beside it; at 0.64 m 0.64 * 0.6 = 0.384 of 1.152 is 0.33. Turned by 90 degrees it
-    # shares 0.6 * 0.6 / 1.176 = 0.31. A car's: 0.48 / 6.24.
-    pedestrian = {(9, 8, 2), (9, 8, 3), (9, 7, 2), (9, 9, 2)}
-    assert places(targets, -1) == pedestrian | {(9, 7, 4), (9, 8, 4), (9, 9, 4)}
-
-
-def test_ignored_boxes_leave_positives_alone() -> None:
-    box = box_at(9, 8)
-    alone, both = assign((PEDESTRIAN, box)), assign((PEDESTRIAN, box), (IGNORED, box))
-    assert places(alone, 1) == places(both, 1) == {(9, 8, 2), (9, 8, 3)}
-    assert np.array_equal(alone.residuals, both.residuals)
-    forced = box_at(9, 2, dx=0.30)  # by force alone, as above
-    assert places(assign((PEDESTRIAN, forced), (IGNORED, forced)), 1) == {(9, 2, 2)}
-
-
-@pytest.mark.parametrize("label", [CAR, PEDESTRIAN, CYCLIST])
-def test_classes_do_not_meet(label: int) -> None:
-    """Even a box that fits the anchors of another class leaves them background."""
-    for size_of in SIZES:
-        targets = assign((label, [*box_at(8, 14)[:3], *SIZES[size_of], 0.0]))
-        touched = {anchor // 2 for _, _, anchor in places(targets, 1) | places(targets, -1)}
-        assert touched == {label}
-
-
-def test_the_better_box_gets_the_anchor() -> None:
-    """Two people 0.32 m apart, each on an anchor of its own: neither takes the other's, whatever the order."""
-    boxes = [(PEDESTRIAN, box_at(9, 8)), (PEDESTRIAN, box_at(9, 9))]
-    for order in (boxes, boxes[::-1]):
-        targets = assign(*order)
-        assert places(targets, 1) == {(9, column, anchor) for column in (8, 9) for anchor in (2, 3)}
-        np.testing.assert_allclose(targets.residuals[:, 0], 0, atol=1e-6)
-
-
-@pytest.mark.parametrize(("x", "y"), [(-0.6, 1.0), (12.5, 1.0), (6.0, -4.5), (6.0, 5.8), (500.0, 0.0)])
-@pytest.mark.parametrize("label", [CAR, IGNORED])
-def test_boxes_outside_the_grid_change_nothing(x: float, y: float, label: int) -> None:
-    """1.8 x 1.4 m: a car's anchor, 3.9 m long one way or the other, meets it within 2.85 m along x, 2.65 m along y.
-
-    The outermost centers are x = 2.32 and 9.60 m, y = -1.76 and 3.04 m.
+    1.95 x 1.6 m within an anchor of 3.9 x 1.6: 0.5; 1 m along x it shares 1.925 x 1.6, 0.4904; 1 m along y 1.95 x 0.6,
+    0.1429; both, 0.1408. The turned anchor, 1.6 x 3.9: 0.3765, the same along y, and 0.1527 wherever x differs.
+    Mean of 0.5, 2 x 0.4904, 2 x 0.1429, 4 x 0.1408, 3 x 0.3765 and 6 x 0.1527: 0.2431, standard deviation 0.1399:
+    positive from 0.3830 within 0.975 m. With 2.05 m the neighbors' centers lie inside.
     """
-    assert not assign((label, [x, y, -1.0, 1.8, 1.4, 1.5, 0.0])).state.any()
+    targets = assign((CAR, [4.0, 3.0, -1.0, length_m, 1.6, 1.56, 0.0]), anchors=SQUARE, assigner="atss")
+    assert places(targets, 1) == {(3, column, 0) for column in columns}
+    assert not (targets.state == -1).any()
 
 
-def test_a_box_across_the_border_is_found_from_inside() -> None:
-    """Its center is 0.5 m before the grid; the nearest anchors, at 2.32 m, are those that overlap it most."""
-    targets = assign((CAR, [1.5, ANCHORS[6, 0, 0, 1], -1.0, 3.9, 1.6, 1.56, 0.0]))
-    # (3.9 - 0.82) / (3.9 + 0.82) = 0.65, and 0.45 one cell further: (3.9 - 1.46) / 5.36 = 0.455. One row beside
-    # it: 3.08 * 1.28 = 3.94 of 8.54 is 0.46.
-    assert places(targets, 1) == {(6, 0, 0)}
-    assert places(targets, -1) == {(6, 1, 0), (5, 0, 0), (7, 0, 0)}
+def test_an_anchor_of_two_boxes_goes_to_the_one_whose_best_it_is() -> None:
+    """A car of the anchor's size would also have the next column, which it overlaps by 2.9 / 4.9 = 0.59.
+
+    A narrow one, 3.0 x 1.0 m, lies within that anchor, 3 / 6.24 = 0.48, and within no other: it is its own. A short one
+    on the car's own center has nothing better either, but overlaps it less.
+    """
+    fitting = [4.0, 3.0, -1.0, 3.9, 1.6, 1.56, 0.0]
+    narrow, short = [5.4, 3.0, -1.0, 3.0, 1.0, 1.56, 0.0], [4.0, 3.1, -1.0, 2.0, 1.6, 1.56, 0.0]
+    for other, column, winner in ((narrow, 5, narrow), (short, 4, fitting)):
+        for order in ([fitting, other], [other, fitting]):
+            targets = assign(*((CAR, box) for box in order), anchors=SQUARE, assigner="atss")
+            taken = dict(zip(targets.positives.tolist(), targets.matched.tolist(), strict=True))
+            assert taken[(3 * 9 + column) * COUNT] == order.index(winner)
+            assert taken[(3 * 9 + 3) * COUNT] == order.index(fitting)
 
 
-def test_no_boxes() -> None:
-    targets = assign()
+def test_fewer_cells_than_candidates() -> None:
+    few = make_anchors(np.arange(2.0), np.arange(3.0), KITTI_CLASSES)
+    targets = assign((CYCLIST, [1.0, 2.0, -0.6, 1.76, 0.6, 1.73, 0.0]), anchors=few, assigner="atss")
+    assert (2, 1, 4) in places(targets, 1)
+
+
+@pytest.mark.parametrize("assigner", ["overlap", "atss"])
+def test_no_boxes(assigner: Assigner) -> None:
+    targets = assign(assigner=assigner)
     assert targets.state.shape == (ROWS, COLUMNS, COUNT) and not targets.state.any()
-    assert targets.positives.shape == targets.directions.shape == (0,)
-    assert targets.residuals.shape == (0, 7)
-    kinds = (targets.state, targets.positives, targets.residuals, targets.directions)
-    assert [array.dtype for array in kinds] == [np.int8, np.int64, np.float32, np.int64]
-
-
-def test_thresholds_come_from_the_class() -> None:
-    """The neighbors of the hand-made case, at IoU 0.667 and 0.429, under other thresholds."""
-    strict = dataclasses.replace(KITTI_CLASSES[PEDESTRIAN], positive_iou=0.7, negative_iou=0.5)
-    classes = (KITTI_CLASSES[0], strict, KITTI_CLASSES[2])
-    boxes = np.array([[8.48, 1.12, -0.9, 0.8, 0.6, 1.73, 0.0]], np.float32)
-    targets = assign_targets(ANCHORS, classes, boxes, np.array([PEDESTRIAN]))
-    assert places(targets, 1) == {(9, 20, 2)}
-    assert places(targets, -1) == {(9, 19, 2), (9, 21, 2), (9, 19, 3), (9, 20, 3), (9, 21, 3)}
+    assert targets.state.dtype == np.int8
+    shapes = [part.shape for part in (targets.positives, targets.anchors, targets.residuals, targets.matched)]
+    assert shapes == [(0,), (0, 7), (0, 7), (0,)]
+    kinds = (targets.positives, targets.anchors, targets.residuals, targets.directions, targets.matched)
+    assert [part.dtype for part in kinds] == [np.int64, np.float32, np.float32, np.int64, np.int64]

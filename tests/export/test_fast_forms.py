@@ -69,12 +69,6 @@ def test_depth_to_space_is_the_transposed_convolution(stride: int) -> None:
     torch.testing.assert_close(Upsample(deblock)(features).permute(0, 3, 1, 2), deblock(features))
 
 
-def test_overlapping_outputs_are_no_depth_to_space() -> None:
-    deblock = nn.Sequential(nn.ConvTranspose2d(5, 3, 3, 2, bias=False), nn.BatchNorm2d(3), nn.ReLU()).eval()
-    with pytest.raises(ValueError, match="outputs overlap"):
-        Upsample(deblock)
-
-
 def test_the_detector_stays_as_it_was() -> None:
     detector = tiny_detector("none")
     before = {name: value.clone() for name, value in detector.state_dict().items()}

@@ -1,6 +1,5 @@
 """A sparse neck from the checkpoint to boxes: bundles in float and in 8 bits, threads, streams, providers, reports."""
 
-import dataclasses
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -10,18 +9,16 @@ import pytest
 
 from asca_deploy import Detector
 from asca_deploy.benchmark import benchmark
-from asca_deploy.bundle import CanvasFormat, PillarSection
 from asca_deploy.golden import golden_stages
 from asca_deploy.manifest import load_pillar_bundle
 from asca_deploy.pillar.pipeline import PillarPipeline, open_backbone
 from asca_export.bundle_writer import ExportOptions
 from asca_export.pillar.export import export_pillar_bundle
-from asca_pillars.base.errors import ConfigError, ProviderError
+from asca_pillars.base.errors import ProviderError
 from asca_pillars.config.pillar import PillarModel
 from asca_pillars.models.checkpoint import Checkpoint
 from asca_pillars.models.scan_detector import ScanDetector
-from tests.export.tiny import CALIBRATION, SCANS
-from tests.export.tiny_sparse import NOTHING, ONE_POINT, sparse_checkpoint
+from tests.export.tiny import CALIBRATION, NOTHING, ONE_POINT, SCANS, sparse_checkpoint
 from tests.helpers.same_detections import same
 from tests.helpers.scenes import SPEC
 
@@ -117,10 +114,3 @@ def test_auto_leaves_out_what_cannot_run_it(int8_bundle: Path) -> None:
     detector = Detector(int8_bundle, provider="auto")
     assert detector.provider == "cpu"
     assert all("fixed shapes" in str(each) for each in detector.candidates if each.provider == "openvino")
-
-
-def test_a_section_must_say_which_cells_are_active() -> None:
-    with pytest.raises(ConfigError, match="neck sparse does not go with active_cells None"):
-        PillarSection("none", 8, CanvasFormat(), "sparse")
-    with pytest.raises(ConfigError, match="neck dense does not go with active_cells fine"):
-        dataclasses.replace(PillarSection("none", 8, CanvasFormat()), active_cells="fine")

@@ -1,8 +1,9 @@
-"""A checkpoint small enough to be exported again and again, and scans for it."""
+"""Checkpoints small enough to be exported again and again, and scans for them."""
 
 import dataclasses
 from typing import Any
 
+import numpy as np
 import torch
 
 from asca_pillars.config.pillar import CpaReading, NetworkConfig, PillarModel
@@ -15,12 +16,19 @@ from tests.helpers.scenes import SPEC, make_scene
 NETWORK = NetworkConfig(pillar_channels=16, block_channels=(16, 24, 32), block_convs=(1, 1, 1), upsample_channels=16)
 SCANS = [make_scene(seed)[0] for seed in range(8)]
 CALIBRATION = [make_scene(seed)[0] for seed in range(100, 108)]
+NOTHING = np.empty((0, 4), np.float32)
+ONE_POINT = np.array([[10.0, 0.5, -1.0, 0.3]], np.float32)
 
 
 def tiny_checkpoint(cpa: CpaReading, spec: PillarSpec = SPEC, **network: Any) -> Checkpoint:
     """Its weights are those of `tiny_detector`."""
     model = _tiny_model(cpa, spec, **network)
     return Checkpoint(Config(name="tiny", model=model), _with_random_weights(model), 0)
+
+
+def sparse_checkpoint(rule: str) -> Checkpoint:
+    spec = SPEC.with_score_threshold(0.02)  # random weights are never sure of anything
+    return tiny_checkpoint("channel", spec, neck="sparse", active_cells=rule)
 
 
 def tiny_detector(cpa: CpaReading, spec: PillarSpec = SPEC, **network: Any) -> PillarDetector:

@@ -37,14 +37,6 @@ def test_weights_at_the_paper_s_width_are_small_and_are_the_same_to_three_digits
     assert weights_sha256(loaded.detector.state_dict()) != weights_sha256(state)
 
 
-def test_a_checkpoint_without_younger_settings_has_their_defaults(tmp_path: Path) -> None:
-    content = checkpoint_content(Checkpoint(NARROW, build_model(NARROW.model), 7))
-    loss = content["hyper_parameters"]["config"]["model"]["loss"]
-    del loss["score_target"], loss["assigner"]
-    torch.save(content, tmp_path / "last.ckpt")
-    assert load_checkpoint(tmp_path / "last.ckpt").config == NARROW
-
-
 @pytest.mark.parametrize(("steps", "said"), [({}, "no 'global_step'"), ({"global_step": None}, "int")])
 def test_a_checkpoint_without_its_steps_is_one_line(tmp_path: Path, steps: dict[str, None], said: str) -> None:
     content = checkpoint_content(Checkpoint(NARROW, build_model(NARROW.model), 7))

@@ -1,12 +1,14 @@
-"""Table convolutions against dense ones, forward and backward."""
+"""Table convolutions against dense ones, and products over padded rows, forward and backward."""
 
 import numpy as np
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 from torch.nn import functional as F  # noqa: N812  (torch's own convention)
 
 from asca_pillars.models import sparse_conv as module
-from asca_pillars.models.sparse_conv import rulebook_conv
+from asca_pillars.models.sparse_conv import linear_rows, rounded_rows, rulebook_conv
 from asca_pillars.ops.pv_rcnn.rulebooks import PV_RCNN_STRIDED, SUBMANIFOLD
 from asca_pillars.ops.sparse.rulebooks import CellMap, Convolution, Shape, map_convolution
 
@@ -60,15 +62,6 @@ def test_equals_the_dense_convolution(
         torch.testing.assert_close(one, other)
 
 
-@pytest.mark.parametrize("convolution", [SUBMANIFOLD, PV_RCNN_STRIDED[0]])
-def test_gradients_are_those_of_finite_differences(convolution: Convolution) -> None:
-    torch.manual_seed(0)
-    source, _, tables = make_tables((4, 3, 4), convolution, share=0.3)
-    features = torch.randn(len(source), 2, dtype=torch.float64, requires_grad=True)
-    weight = torch.randn(3, 2, *convolution.kernel, dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(lambda f, w: rulebook_conv(f, w, *tables), (features, weight))
-
-
 def test_nothing_active_gives_nothing() -> None:
     _, _, (table, back) = make_tables((1, 8, 10), map_convolution(3, stride=2, padding=1), share=0)
     weight = torch.randn(3, 2, 1, 3, 3, requires_grad=True)
@@ -110,3 +103,31 @@ def test_the_same_bits_in_every_run() -> None:
         torch.set_num_threads(threads)
     for other in results[1:]:
         assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
+
+
+@given(st.integers(0, 1 << 22))
+def test_rounds_up_by_a_sixteenth_at_most(rows: int) -> None:
+    rounded = rounded_rows(rows)
+    assert rows <= rounded <= rows + rows // 16
+    assert rounded_rows(rounded) == rounded
+
+
+def test_few_numbers_of_rows_remain() -> None:
+    assert len({rounded_rows(rows) for rows in range(4096, 8192)}) <= 17
+
+
+@pytest.mark.parametrize("rows", [0, 1, 33, 1001])
+def test_a_product_in_lower_precision_is_that_of_the_rows(rows: int) -> None:
+    features = torch.randn(rows, 12, generator=torch.Generator().manual_seed(0), requires_grad=True)
+    weight, bias = torch.randn(8, 12, requires_grad=True), torch.randn(8, requires_grad=True)
+    with torch.autocast("cpu", torch.bfloat16):
+        found, expected = linear_rows(features, weight, bias), F.linear(features, weight, bias)
+    assert found.dtype == torch.bfloat16
+    torch.testing.assert_close(found, expected)
+    upstream = torch.randn_like(expected)
+    for one, other in zip(
+        torch.autograd.grad(found, (features, weight, bias), upstream),
+        torch.autograd.grad(expected, (features, weight, bias), upstream),
+        strict=True,
+    ):
+        torch.testing.assert_close(one, other)

@@ -1,4 +1,4 @@
-"""A dataset whose loader process fails; it imports little, because each process imports it."""
+"""A dataset whose loader process fails, and its loader; it imports little, because each process imports it."""
 
 import os
 import signal
@@ -29,3 +29,19 @@ class Numbers:
         elif index == 4 and self.what:
             os.kill(os.getpid(), getattr(signal, self.what))
         return index
+
+
+def loader_of(what: str, timeout: float = 1) -> Any:
+    from asca_pillars.training.loaders import BatchLoader
+    from asca_pillars.training.shared_batches import loader_context, start_loader_process
+
+    return BatchLoader(
+        Numbers(what),  # type: ignore[arg-type]
+        batch_size=2,
+        num_workers=2,
+        collate_fn=list,
+        persistent_workers=True,
+        worker_init_fn=start_loader_process,
+        multiprocessing_context=loader_context(),
+        timeout=timeout,
+    )

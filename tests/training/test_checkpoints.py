@@ -1,4 +1,4 @@
-"""Checkpoints of a run: two generations, the one to go on from; and whose run a folder holds."""
+"""Checkpoints of a run: two generations, the one to go on from, and weights that a new run starts from."""
 
 import dataclasses
 import signal
@@ -8,20 +8,21 @@ from typing import Any, cast
 
 import pytest
 import torch
-import yaml
 
-from asca_pillars.base.errors import ConfigError, TrainingError
+from asca_deploy import shipped
+from asca_deploy.shipped import find_checkpoint
+from asca_pillars.base import installation
+from asca_pillars.base.errors import BundleError, TrainingError
 from asca_pillars.base.schema import to_dict
-from asca_pillars.config.tree import Config, DataConfig, TrainConfig
-from asca_pillars.data.training_frames import TrainingFrames
+from asca_pillars.config.pillar import PillarModel
 from asca_pillars.models.build import build_model
+from asca_pillars.models.checkpoint import Checkpoint, load_checkpoint
 from asca_pillars.models.checkpoint_file import save_weights
-from asca_pillars.training import loop
 from asca_pillars.training.checkpoints import AtomicCheckpointIO, BestCheckpoint, checkpoint_to_resume
 from asca_pillars.training.loop import train
-from asca_pillars.training.run_folder import TrainingInputs, claim_run_folder, measure_input
+from tests.helpers.saved_checkpoint import save_checkpoint
 from tests.helpers.scenes import write_dataset
-from tests.helpers.tiny_run import CONFIG
+from tests.helpers.tiny_run import CONFIG, NETWORK, with_train
 
 MODEL = CONFIG.model
 
@@ -34,12 +35,6 @@ def state_of_a_run(step: int) -> dict[str, Any]:
 
 def save(folder: Path, step: int, files: AtomicCheckpointIO) -> None:
     files.save_checkpoint(state_of_a_run(step), folder / "last.ckpt")
-
-
-def learn(run: Path) -> None:
-    """A run has a checkpoint from its first steps on."""
-    (run / "checkpoints").mkdir(parents=True)
-    (run / "checkpoints" / "last.ckpt").touch()
 
 
 def step_of(path: Path | None) -> int:
@@ -120,13 +115,6 @@ def test_a_truncated_checkpoint_is_passed_over_and_not_kept(tmp_path: Path, size
     assert step_of(tmp_path / "last.ckpt") == 3 and step_of(tmp_path / "previous.ckpt") == 1
 
 
-def test_only_damaged_checkpoints_are_one_line_with_a_remedy(tmp_path: Path) -> None:
-    (tmp_path / "last.ckpt").write_bytes(b"PK junk")
-    with pytest.raises(TrainingError, match=r"last\.ckpt is damaged .*--init .*best\.ckpt") as caught:
-        checkpoint_to_resume(tmp_path, MODEL)
-    assert "\n" not in str(caught.value)
-
-
 def test_what_is_no_state_of_a_run_is_named(tmp_path: Path) -> None:
     whole, path = state_of_a_run(3) | {"hyper_parameters": {"config": to_dict(CONFIG)}}, tmp_path / "last.ckpt"
     torch.save(whole, tmp_path / "whole.ckpt")
@@ -137,7 +125,7 @@ def test_what_is_no_state_of_a_run_is_named(tmp_path: Path) -> None:
         (weights, r"last\.ckpt holds weights alone, not the state of a run .*--init .*last\.ckpt"),
         (whole["state_dict"], r"last\.ckpt is no checkpoint of a run"),
         (torch.zeros(3), "is damaged .*it holds a Tensor"),
-        ([1, 2], "is damaged .*it holds a list"),
+        ([1, 2], r"last\.ckpt is damaged .*it holds a list.*--init .*best\.ckpt"),
         (whole | {"state_dict": 3}, "is damaged .`state_dict` is a int"),
         (whole | {"loops": "x"}, "is damaged .`loops` is a str"),
         (whole | {"state_dict": whole["state_dict"] | other}, r"another network \(encode\.linear\.weight differs"),
@@ -162,17 +150,6 @@ def test_a_best_checkpoint_of_another_kind_is_replaced(tmp_path: Path) -> None:
         assert not best.best_k_models
 
 
-def test_a_run_whose_last_checkpoint_is_its_weights_alone_is_one_line(tmp_path: Path) -> None:
-    data = write_dataset(tmp_path / "data", 3)
-    last = train(CONFIG, data, tmp_path / "run")
-    (last.parent / "weights.ckpt").replace(last)
-    (last.parent / "previous.ckpt").unlink(missing_ok=True)
-    before = last.read_bytes()
-    with pytest.raises(TrainingError, match=r"last\.ckpt holds weights alone"):
-        train(CONFIG, data, tmp_path / "run")
-    assert last.read_bytes() == before
-
-
 def test_of_hidden_files_only_those_of_a_killed_run_go(tmp_path: Path) -> None:
     """Jupyter keeps a hidden folder wherever it has opened a file."""
     folder = tmp_path / "run" / "checkpoints"
@@ -188,87 +165,31 @@ def test_of_hidden_files_only_those_of_a_killed_run_go(tmp_path: Path) -> None:
     assert (folder / ".ipynb_checkpoints" / "notes.ipynb").exists()
 
 
-SEEN = TrainingInputs(2, "ab", 1)
+STILL = with_train(epochs=1, learning_rate=1e-12)
+OTHER = dataclasses.replace(CONFIG, model=PillarModel(network=dataclasses.replace(NETWORK, pillar_channels=8)))
 
 
-def test_a_run_is_the_same_with_other_workers_folders_and_intervals(tmp_path: Path) -> None:
-    claim_run_folder(tmp_path, CONFIG, SEEN)
-    data = DataConfig(workers=7, prepared=str(tmp_path))
-    recipe = dataclasses.replace(CONFIG.train, checkpoint_steps=9)
-    claim_run_folder(tmp_path, dataclasses.replace(CONFIG, data=data, train=recipe), SEEN)
-    learn(tmp_path)
-    with pytest.raises(TrainingError, match=r"data\.min_points = 1, now data\.min_points = 2"):
-        claim_run_folder(tmp_path, dataclasses.replace(CONFIG, data=DataConfig(min_points=2)), SEEN)
-
-
-def test_a_run_goes_on_with_its_own_frames_and_processes_alone(tmp_path: Path) -> None:
-    claim_run_folder(tmp_path, CONFIG, SEEN)
-    claim_run_folder(tmp_path, CONFIG, TrainingInputs(2, "ac", 1))  # nothing is learnt yet
-    learn(tmp_path)
-    claim_run_folder(tmp_path, CONFIG, TrainingInputs(2, "ac", 1))
-    with pytest.raises(TrainingError, match=r"frames\.json: .* on 2 frames, now there are 3, or others; give"):
-        claim_run_folder(tmp_path, CONFIG, TrainingInputs(3, "abc", 1))
-    with pytest.raises(TrainingError, match=r"started with 1 process\(es\), now 2: .* give as many --devices"):
-        claim_run_folder(tmp_path, CONFIG, TrainingInputs(2, "ac", 2))
-    (tmp_path / "frames.json").write_text("{")
-    with pytest.raises(ConfigError, match=r"frames\.json: not valid YAML"):
-        claim_run_folder(tmp_path, CONFIG, SEEN)
-    (tmp_path / "frames.json").unlink()  # an older version wrote none
-    claim_run_folder(tmp_path, CONFIG, SEEN)
-
-
-def test_a_run_may_be_made_longer_where_its_schedule_allows(tmp_path: Path) -> None:
-    def of(**recipe: object) -> Config:
-        return dataclasses.replace(CONFIG, train=TrainConfig(**recipe))  # type: ignore[arg-type]
-
-    claim_run_folder(tmp_path / "step", of(epochs=2, schedule="step"), SEEN)
-    learn(tmp_path / "step")
-    claim_run_folder(tmp_path / "step", of(epochs=5, schedule="step"), SEEN)
-    with pytest.raises(TrainingError, match=r"train\.epochs = 5, now train\.epochs = 4; choose another"):
-        claim_run_folder(tmp_path / "step", of(epochs=4, schedule="step"), SEEN)
-    with pytest.raises(TrainingError, match=r"train\.seed = 0, now train\.seed = 1"):
-        claim_run_folder(tmp_path / "step", of(epochs=9, schedule="step", seed=1), SEEN)
-    claim_run_folder(tmp_path / "cycle", of(epochs=2, schedule="one_cycle"), SEEN)
-    learn(tmp_path / "cycle")
-    with pytest.raises(TrainingError, match=r"one_cycle schedule is planned .*--init .*last\.ckpt"):
-        claim_run_folder(tmp_path / "cycle", of(epochs=3, schedule="one_cycle"), SEEN)
-
-
-def test_a_stable_run_may_be_made_longer_until_its_rate_falls(tmp_path: Path) -> None:
-    def of(epochs: int) -> Config:
-        recipe = TrainConfig(epochs=epochs, batch_size=1, schedule="warmup_stable_decay", cooldown=0.25)
-        return dataclasses.replace(CONFIG, train=recipe)
-
-    seen = TrainingInputs(10, "ab", 1)  # ten steps an epoch: of four epochs the last ten steps fall
-    claim_run_folder(tmp_path, of(4), seen)
-    learn(tmp_path)
-    with pytest.raises(TrainingError, match=r"fallen since step 30 of 40: start .*--init .*last\.ckpt"):
-        claim_run_folder(tmp_path, of(8), seen, steps=31)
-    claim_run_folder(tmp_path, of(8), seen, steps=30)
-
-
-def test_a_run_that_learnt_nothing_gives_way(tmp_path: Path) -> None:
-    """The corrected command may be given again, and nothing of the mistaken one stays."""
-    claim_run_folder(tmp_path, CONFIG, SEEN)
-    (tmp_path / "environment.json").write_text("of the mistaken run")
-    other = dataclasses.replace(CONFIG, data=DataConfig(min_points=2))
-    claim_run_folder(tmp_path, other, SEEN)
-    assert yaml.safe_load((tmp_path / "config.yaml").read_text()) == to_dict(other)
-    assert "torch" in (tmp_path / "environment.json").read_text()
-
-
-@pytest.mark.parametrize("mistake", [{"init": "nosuch.ckpt"}, {"devices": "many"}])
-def test_a_mistyped_start_is_refused_before_anything_is_done(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, mistake: dict[str, str]
-) -> None:
-    data = write_dataset(tmp_path / "data", 3)
-    monkeypatch.setattr(loop, "DetectionData", lambda *_: pytest.fail("the data were prepared"))
-    with pytest.raises(TrainingError, match="|".join(mistake.values())):
-        train(CONFIG, data, tmp_path / "run", **mistake)  # type: ignore[arg-type]
-    assert not (tmp_path / "run").exists()
-
-
-def test_a_damaged_measurement_of_the_input_is_one_line(tmp_path: Path) -> None:
-    (tmp_path / "expected_input.yaml").write_text("points_per_scan: [")
-    with pytest.raises(ConfigError, match=r"expected_input\.yaml: not valid YAML: "):
-        measure_input(tmp_path, cast("TrainingFrames", None), keep=True)  # which is not asked where something was kept
+def test_a_run_can_start_from_other_weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    data, bundle, first = write_dataset(tmp_path / "data", 3), tmp_path / "bundle", tmp_path / "first.ckpt"
+    torch.manual_seed(3)
+    other = Checkpoint(CONFIG, build_model(CONFIG.model), 7)
+    save_checkpoint(first, other)
+    bundle.mkdir()
+    first_weights = bundle / "weights.ckpt"
+    first_weights.write_bytes(first.read_bytes())
+    for module in (shipped, installation):
+        monkeypatch.setattr(module, "shipped_models", lambda: {"a_model": bundle})
+    assert [find_checkpoint(init) for init in (first, bundle, "a_model")] == [first, first_weights, first_weights]
+    found = load_checkpoint(train(STILL, data, tmp_path / "run", init=first_weights)).detector.parameters()
+    for expected, parameter in zip(other.detector.parameters(), found, strict=True):
+        torch.testing.assert_close(parameter, expected)
+    for init, error, message in (
+        (first, TrainingError, r"another network: \S+ is \(16, 9\) there and \(8, 9\) in this configuration"),
+        ("another", BundleError, "no bundle of that name ships"),
+        (data, BundleError, r"data: holds no weights\.ckpt, .* a_model has one"),
+        (tmp_path / "none.ckpt", TrainingError, "no such checkpoint"),
+    ):
+        with pytest.raises(error, match=message) as caught:
+            train(OTHER, data, tmp_path / "refused", init=find_checkpoint(init))
+        assert "\n" not in str(caught.value)
+    assert not (tmp_path / "refused").exists()  # the corrected command finds nothing in its way

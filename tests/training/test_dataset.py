@@ -7,10 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from torch.utils._pytree import tree_leaves
 
 from asca_pillars.base.errors import DatasetError
 from asca_pillars.config.pillar import LossConfig, NetworkConfig, PillarModel
-from asca_pillars.config.tree import AugmentConfig, Config, DataConfig
+from asca_pillars.config.tree import Config, DataConfig
 from asca_pillars.data.frames import LabeledFrame, read_frame
 from asca_pillars.data.kitti import KittiObject, KittiSplit, in_image, objects_from_boxes, write_image_set, write_labels
 from asca_pillars.data.labeled_split import LabeledSplit
@@ -173,19 +174,6 @@ def test_the_assigner_of_the_configuration_makes_the_targets(tmp_path: Path) -> 
     assert frames.preparation == build_pillar_detector(model).preparation
 
 
-def test_limits_keep_the_same_pillars_in_every_epoch(tmp_path: Path) -> None:
-    tight = dataclasses.replace(SPEC, limits=dataclasses.replace(SPEC.limits, max_pillars=50))
-    still = AugmentConfig(
-        flip_probability=0.0, rotation_rad=0.0, scale=(1.0, 1.0), object_rotation_rad=0.0, object_shift_m=0.0
-    )
-    config = dataclasses.replace(CONFIG, model=PillarModel(spec=tight), augment=still)
-    frames = open_dataset(write_dataset(tmp_path, 2), config, training=True)
-    first, second = frames.sample(0, 0), frames.sample(1, 0)
-    assert np.array_equal(first.frame.points, second.frame.points)
-    assert len(first.prepared.pillars.cells) == 50
-    assert np.array_equal(first.prepared.pillars.cells, second.prepared.pillars.cells)
-
-
 def samples(root: Path) -> list[Sample]:
     """Three frames of different size; the one in the middle has no points and nothing to find."""
     frames = open_dataset(write_dataset(root, 3, val_frames=2), CONFIG, training=False)
@@ -244,17 +232,7 @@ def test_batches_keep_frames_apart(tmp_path: Path, order: tuple[int, ...]) -> No
     assert types == [torch.float32, torch.int64, torch.int64, torch.int8, torch.int64]
 
 
-def test_a_batch_moves_as_a_whole(tmp_path: Path) -> None:
-    batch = collated(samples(tmp_path))
-    assert isinstance(batch.inputs, LabeledPillars)
-    frame_pillars = list(batch.inputs.pillars.frame_pillars)
-    assert batch.to("meta") is batch
-    *tensors, found, _, _, _ = batch.inputs.pillars
-    assert {tensor.device.type for tensor in (*tensors, *batch.inputs.targets)} == {"meta"}
-    assert list(found) == frame_pillars and isinstance(batch.boxes[0], np.ndarray)
-
-
-def test_the_tables_of_a_sparse_neck_move_with_the_batch(tmp_path: Path) -> None:
+def test_a_batch_moves_as_a_whole_with_the_tables_of_a_sparse_neck(tmp_path: Path) -> None:
     model = PillarModel(spec=SPEC, network=NetworkConfig(neck="sparse"))
     frames = open_dataset(write_dataset(tmp_path, 3), dataclasses.replace(CONFIG, model=model), training=True)
     batch = Collate(frames.preparation)([frames.sample(0, 0), frames.sample(0, 1)])
@@ -262,11 +240,13 @@ def test_the_tables_of_a_sparse_neck_move_with_the_batch(tmp_path: Path) -> None
     neck = batch.inputs.pillars.neck
     assert neck is not None and sum(neck.frame_rows) == len(neck.head_cells)
     assert len(neck.levels[0].strided_back) == len(batch.inputs.pillars.cells)
-    inputs = batch.to("meta").inputs
-    assert isinstance(inputs, LabeledPillars)
-    moved = inputs.pillars.neck
-    assert moved is not None and moved.frame_rows == neck.frame_rows
-    assert {part.device.type for level in moved.levels for part in level} == {"meta"}
+    frame_pillars = list(batch.inputs.pillars.frame_pillars)
+    assert batch.to("meta") is batch and isinstance(batch.boxes[0], np.ndarray)
+    moved = batch.inputs.pillars
+    assert moved.neck is not None and moved.neck.frame_rows == neck.frame_rows
+    assert list(moved.frame_pillars) == frame_pillars
+    devices = {each.device.type for each in tree_leaves(batch.inputs) if isinstance(each, torch.Tensor)}
+    assert devices == {"meta"}
 
 
 @pytest.mark.parametrize(

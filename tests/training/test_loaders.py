@@ -1,4 +1,4 @@
-"""Processes that load batches: when one fails, the run ends with one line, and never waits for it."""
+"""The order of frames, and processes that load batches: when one fails, the run ends with one line, without waiting."""
 
 import os
 import subprocess
@@ -9,28 +9,49 @@ from pathlib import Path
 import pytest
 import yaml
 
-from asca_pillars.base.errors import WorkerError
+from asca_pillars.base.errors import TrainingError, WorkerError
 from asca_pillars.base.schema import to_dict
 from asca_pillars.config.pillar import NetworkConfig, PillarModel
 from asca_pillars.config.tree import Config, TrainConfig
 from asca_pillars.training import loaders
-from asca_pillars.training.loaders import BatchLoader
-from asca_pillars.training.shared_batches import loader_context, start_loader_process
+from asca_pillars.training.loaders import EpochSampler
 from tests.helpers.scenes import SPEC, write_dataset
-from tests.training.failing_numbers import Numbers
+from tests.training.failing_numbers import loader_of
 
 
-def loader_of(what: str, timeout: float = 1) -> BatchLoader:
-    return BatchLoader(
-        Numbers(what),  # type: ignore[arg-type]
-        batch_size=2,
-        num_workers=2,
-        collate_fn=list,
-        persistent_workers=True,
-        worker_init_fn=start_loader_process,
-        multiprocessing_context=loader_context(),
-        timeout=timeout,
-    )
+def test_sampler_goes_on_where_the_steps_stopped() -> None:
+    step = 0
+    sampler = EpochSampler(11, 2, seed=0, step=lambda: step)
+    epochs = []
+    for _ in range(2):
+        epochs.append(list(sampler))
+        step += len(sampler)
+    assert [len(epoch) for epoch in epochs] == [5, 5] and epochs[0] != epochs[1]
+    step = 5 + 3
+    assert list(sampler) == epochs[1][3:]
+    assert {epoch for batch in epochs[1] for epoch, _ in batch} == {1}
+
+
+def test_ranks_share_an_epoch() -> None:
+    ranks = [EpochSampler(11, 2, 0, lambda: 0, rank=rank, world_size=2) for rank in range(2)]
+    numbers = [{number for batch in sampler for _, number in batch} for sampler in ranks]
+    assert [len(sampler) for sampler in ranks] == [2, 2]
+    assert len(numbers[0]) == len(numbers[1]) == 4 and not numbers[0] & numbers[1]
+
+
+def test_validation_sees_every_frame_once() -> None:
+    assert [number for batch in EpochSampler(5, 2, 0, None) for _, number in batch] == [0, 1, 2, 3, 4]
+
+
+def test_validation_gives_every_rank_as_many_batches() -> None:
+    ranks = [EpochSampler(5, 2, 0, None, rank=rank, world_size=3) for rank in range(3)]
+    seen = [[number for batch in sampler for _, number in batch] for sampler in ranks]
+    assert seen == [[0, 3], [1, 4], [2, 0]] and [len(sampler) for sampler in ranks] == [1, 1, 1]
+
+
+def test_too_few_frames_for_a_batch() -> None:
+    with pytest.raises(TrainingError, match="3 training frames do not fill one batch of 4"):
+        EpochSampler(3, 4, 0, lambda: 0)
 
 
 def test_batches_come_in_order_epoch_after_epoch() -> None:
@@ -96,7 +117,7 @@ def test_training_where_shared_memory_is_small(tmp_path: Path) -> None:
 
 LEFT_OPEN = """
 if __name__ == "__main__":  # loader processes import this file, too
-    from tests.training.test_loaders import loader_of
+    from tests.training.failing_numbers import loader_of
     loader = loader_of("")
     next(iter(loader))
 """

@@ -1,6 +1,10 @@
-"""Batches between processes: the same tensors, and none of them through /dev/shm."""
+"""Loader processes and the batches that they send: the same tensors, and none of them through /dev/shm."""
 
 import os
+import signal
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from multiprocessing.connection import Connection
 from multiprocessing.reduction import ForkingPickler
 from pathlib import Path
@@ -16,7 +20,7 @@ from asca_pillars.base.errors import DatasetError, WorkerError
 from asca_pillars.config.pillar import NetworkConfig, PillarModel
 from asca_pillars.config.tree import Config
 from asca_pillars.training.dataset import Batch, Collate, open_dataset
-from asca_pillars.training.shared_batches import ShareCollated, SharedInputs, loader_context
+from asca_pillars.training.shared_batches import ShareCollated, SharedInputs, ignore_interrupts, loader_context
 from tests.helpers.scenes import SPEC, write_dataset
 from tests.models.pv_rcnn.tiny_pv_rcnn import tiny_config
 from tests.models.two_stage.tiny_refine import opened_config, write_first_stage
@@ -48,28 +52,58 @@ def made_up() -> Outer:
     return Outer(Inner(tensors, 3), None, np.arange(4))
 
 
+@contextmanager
+def started(target: Callable[[Connection], None]) -> Iterator[tuple[Any, Connection]]:
+    """A process as loaders start them, and the end of its connection here."""
+    context = loader_context()
+    here, there = context.Pipe()
+    process = context.Process(target=target, args=(there,))
+    process.start()
+    yield process, here
+    process.join(30)
+    here.close()
+    there.close()
+
+
 def send(connection: Connection) -> None:
+    connection.send({name: name in sys.modules for name in ("asca_pillars.training.dataset", "lightning")})
     connection.send(SharedInputs(made_up()))
     connection.recv()
 
 
 def test_another_process_gets_the_same_tensors() -> None:
-    context = loader_context()
-    here, there = context.Pipe()
-    process = context.Process(target=send, args=(there,))
-    process.start()
-    found, expected = here.recv(), made_up()
+    with started(send) as (process, here):
+        assert here.recv() == {"asca_pillars.training.dataset": True, "lightning": False}, "all it needs, not the loop"
+        found = here.recv()
+        here.send(None)
+        process.join()
+    expected = made_up()
     assert isinstance(found, Outer) and found.inner.frames == 3 and found.nothing is None
     assert np.array_equal(found.array, expected.array)
     for own, other in zip(found.inner.tensors, expected.inner.tensors, strict=True):
         assert own.dtype == other.dtype and own.shape == other.shape and torch.equal(own, other)
         assert own.data_ptr() % 64 == 0
     found.inner.tensors[0].zero_()  # it may be written
-    here.send(None)
-    process.join()
     assert int(found.inner.tensors[5][-1]) == 99_999  # and lives on when the other has ended
-    here.close()
-    there.close()
+
+
+def answer(connection: Connection) -> None:
+    ignore_interrupts()
+    connection.send("ready")
+    while connection.recv() is None:
+        connection.send("still here")
+
+
+def test_a_process_outlives_the_first_sigterm_of_its_job() -> None:
+    """As Ctrl-C, which reaches every process of a terminal; the second one is the loader's own."""
+    with started(answer) as (process, here):
+        assert here.poll(30) and here.recv() == "ready"
+        for number in (signal.SIGINT, signal.SIGTERM):
+            os.kill(process.pid, number)
+            here.send(None)
+            assert here.poll(30) and here.recv() == "still here"
+        process.terminate()
+    assert process.exitcode == -signal.SIGTERM
 
 
 def a_batch(inputs: Any) -> Batch:
@@ -78,13 +112,15 @@ def a_batch(inputs: Any) -> Batch:
 
 def inputs_of(family: str, root: Path) -> Any:
     """A batch of two frames of this family of detectors."""
-    network = NetworkConfig(neck="sparse" if family == "sparse" else "dense")
-    configs = {
-        "pv_rcnn": tiny_config,
-        "pillar_refine": lambda: opened_config(write_first_stage(root / "first.ckpt")),
-    }
-    make = configs.get(family, lambda: Config(model=PillarModel(spec=SPEC, network=network)))
-    frames = open_dataset(write_dataset(root / "data", 3), make(), training=True)
+    match family:
+        case "pv_rcnn":
+            config = tiny_config()
+        case "pillar_refine":
+            config = opened_config(write_first_stage(root / "first.ckpt"))
+        case _:
+            network = NetworkConfig(neck="sparse" if family == "sparse" else "dense")
+            config = Config(model=PillarModel(spec=SPEC, network=network))
+    frames = open_dataset(write_dataset(root / "data", 3), config, training=True)
     batch = Collate(frames.preparation)([frames.sample(0, 0), frames.sample(0, 1)])
     assert isinstance(batch, Batch)
     return batch.inputs

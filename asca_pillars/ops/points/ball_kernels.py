@@ -1,4 +1,4 @@
-"""Compiled loops of `ball_query` and `cube_neighbors`; tests/ops/numpy_kernels.py has them in NumPy."""
+"""Compiled loops of `ball_query`, `three_nearest` and `nearest_in_cubes`."""
 
 from typing import Any, TypeAlias
 
@@ -39,7 +39,7 @@ def ball_query(
 
 
 def three_nearest(xyz: _Floats, centers: _Floats, columns: Columns) -> tuple[_Integers, _Floats]:
-    """Compute `numpy_kernels._three_nearest`, in rings of columns around each query.
+    """Find the three nearest points in rings of columns around each query.
 
     Metres (N, 3), (Q, 3) -> indices (Q, 3) and squared distances (Q, 3) in m²; N and infinity where there is no point.
     """
@@ -60,7 +60,7 @@ def nearest_in_cubes(
     offsets: _Floats,
     reach_m: np.float32,
 ) -> _Integers:
-    """Compute `numpy_kernels._nearest_in_cubes` in columns `first` to `last` (Q, 2): (N, 3), (Q, 3) -> (Q, T, 3)."""
+    """Look through columns `first` to `last` (Q, 2) of each cube: (N, 3), (Q, 3) -> (Q, T, 3)."""
     nearest = np.empty((len(centers), len(offsets), 3), np.int32)
     at = centers, first, last
     room = np.empty(len(xyz), np.int32)

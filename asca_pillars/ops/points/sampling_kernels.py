@@ -1,4 +1,4 @@
-"""Compiled loops of `columns`, `farthest_points` and `bilinear`; tests/ops/numpy_kernels.py has them in NumPy."""
+"""Compiled loops of `sampling`: columns, farthest points, circles and bilinear interpolation."""
 
 import math
 from typing import Any
@@ -38,7 +38,7 @@ def sort(
 
 
 def farthest_points(xyz: _Floats, count: int, columns: Columns) -> _Integers:
-    """Compute `numpy_kernels._farthest_points` by columns: (N, 3) in metres -> indices (S,), S at most `count`."""
+    """Sample the farthest points by columns: (N, 3) in metres -> indices (S,), S at most `count`."""
     cells = len(columns.starts) - 1
     chosen = np.empty(min(count, len(xyz)), np.int32)
     found = _farthest_points(
@@ -50,7 +50,7 @@ def farthest_points(xyz: _Floats, count: int, columns: Columns) -> _Integers:
 
 
 def near_circles(points: _Floats, centers: _Floats, squared: _Floats) -> _Floats:
-    """Compute `numpy_kernels._near_circles`: rows (N, 4), circles (R, 2) in metres, (R,) in m² -> rows (M, 4)."""
+    """Keep the points in any of the circles: rows (N, 4), circles (R, 2) in metres, (R,) in m² -> rows (M, 4)."""
     if not len(centers):
         return points[:0]
     reach = np.sqrt(squared)[:, None]
@@ -67,7 +67,7 @@ def near_circles(points: _Floats, centers: _Floats, squared: _Floats) -> _Floats
 
 
 def read_map(rows: NDArray[Any], cells: _Integers, weights: _Floats) -> _Floats:
-    """Compute `numpy_kernels._read_map`: rows (H * W, C) float32 or uint8, cells and weights (K, 4) -> (K, C)."""
+    """Interpolate a map: rows (H * W, C) float32 or uint8, cells and weights (K, 4) -> (K, C)."""
     read = np.zeros((len(cells), rows.shape[1]), np.float32)
     (_read_steps if rows.dtype == np.uint8 else _read_floats)(rows, cells, weights, read)
     return read

@@ -1,4 +1,4 @@
-"""Compiled loops of `voxelize`; tests/ops/numpy_kernels.py has them in NumPy."""
+"""Compiled loops of `voxelize`."""
 
 import math
 
@@ -28,7 +28,7 @@ def cells_of_points(
     shape: Shape,
     cells: _Integers,
 ) -> None:
-    """Compute `numpy_kernels._cells_of_points`: (M, >=3) in metres -> flat indices (M,)."""
+    """Find the voxel of each point, -1 outside: (M, >=3) in metres -> flat indices (M,)."""
     for i in range(len(points)):
         cells[i] = -1
         if (

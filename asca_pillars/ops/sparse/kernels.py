@@ -1,4 +1,4 @@
-"""Compiled loops of `CellMap`; tests/ops/numpy_kernels.py has them in NumPy.
+"""Compiled loops of `CellMap`.
 
 Masks stay uint64 throughout, because numba turns a sum of uint64 and int64 into a float; indices are unsigned where it
 matters, because for signed ones it checks for negative values, which count from the end.

@@ -22,8 +22,7 @@ from asca_pillars.models.pillar.network import PillarDetector
 from asca_pillars.models.pillar.preparation import batch_pillars
 from asca_pillars.ops.pillar.neck_rulebooks import NeckRulebooks
 from tests.deploy.conftest import needs_openvino
-from tests.export.tiny import CALIBRATION, SCANS, tiny_checkpoint, tiny_detector
-from tests.export.tiny_sparse import NOTHING, ONE_POINT, sparse_checkpoint
+from tests.export.tiny import CALIBRATION, NOTHING, ONE_POINT, SCANS, sparse_checkpoint, tiny_checkpoint, tiny_detector
 from tests.helpers.scenes import SPEC
 
 RULES = ("sub", "fine")

@@ -76,7 +76,7 @@ def test_the_bundle_says_what_it_is(folders: tuple[Path, Path]) -> None:
 
 
 def test_its_report_by_both_bundles(folders: tuple[Path, Path]) -> None:
-    (exact, floating), (rounded, eight_bit) = (opened(folder) for folder in folders)
+    (exact, floating), (_, eight_bit) = (opened(folder) for folder in folders)
     scores = []
     for pipeline in (floating, eight_bit):
         maps = [pipeline.infer(pipeline.prepare(points, []), []).maps for points in SCANS]
@@ -85,7 +85,6 @@ def test_its_report_by_both_bundles(folders: tuple[Path, Path]) -> None:
     assert report is not None
     assert logit_error(scores[0], iter(scores[1]), SPEC) == pytest.approx(report.logit_rms_error, rel=1e-3)
     assert sum(len(exact(points)) for points in SCANS) == report.boxes
-    assert sum(len(rounded(points)) for points in SCANS) >= report.boxes_matched - report.boxes_added
 
 
 def test_graphs_multiply_in_8_bits_and_the_second_stage_does_not(folders: tuple[Path, Path]) -> None:
@@ -153,17 +152,6 @@ def test_onnxruntime_computes_what_the_graph_says(folders: tuple[Path, Path], na
     # 2 % here. The scans without are the same.
     for output, of_scans in errors.items():
         assert np.median(of_scans) < 1e-5 and max(of_scans) < 0.03, (output, of_scans)
-
-
-@pytest.mark.parametrize("threads", [2, 4])
-def test_more_threads_change_no_bit(folders: tuple[Path, Path], threads: int) -> None:
-    one, several = (Detector(folders[1], threads=count) for count in (1, threads))
-    expected = one(SCANS[0])
-    assert len(expected)
-    for _ in range(3):
-        found = several(SCANS[0])
-        np.testing.assert_array_equal(found.boxes, expected.boxes)
-        np.testing.assert_array_equal(found.scores, expected.scores)
 
 
 def test_scans_with_little_or_nothing_and_a_stream(folders: tuple[Path, Path]) -> None:

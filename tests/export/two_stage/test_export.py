@@ -1,7 +1,6 @@
 """Both stages from training to boxes: checkpoint, bundle, runtime."""
 
-import json
-import shutil
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,23 +11,25 @@ import pytest
 import torch
 
 from asca_deploy import Detector
-from asca_deploy.bundle import GRAPHS, MANIFEST
+from asca_deploy.bundle import GRAPHS
 from asca_deploy.golden import golden_stages
 from asca_deploy.manifest import load_pillar_bundle
 from asca_deploy.two_stage.pipeline import RefinePipeline
 from asca_export.bundle_writer import ExportOptions
 from asca_export.int8 import MAX_LOGIT_ERROR
 from asca_export.pillar.export import export_pillar_bundle
-from asca_export.two_stage import export as refine_exporter
 from asca_export.two_stage.export import export_refine_bundle
+from asca_export.two_stage.first_stage import open_exported
 from asca_export.two_stage.graphs import fold_norms
+from asca_export.two_stage.parity import check_refine_parity
 from asca_pillars.base.errors import BundleError, ExportError
 from asca_pillars.models.build import build_model
 from asca_pillars.models.checkpoint import Checkpoint, load_checkpoint
 from asca_pillars.models.pillar.network import PillarDetector
+from asca_pillars.models.two_stage.first_stage import with_first_stage
 from asca_pillars.models.two_stage.network import RefineDetector
 from asca_pillars.training.loop import train
-from tests.export.deployed import assert_same_detector
+from tests.export.deployed import assert_same_detector, changed_manifest
 from tests.export.tiny import CALIBRATION, SCANS, tiny_checkpoint
 from tests.helpers.made_once import made_once
 from tests.helpers.saved_checkpoint import save_checkpoint
@@ -39,22 +40,23 @@ from tests.models.two_stage.tiny_refine import opened_config, tiny_refine_config
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    """A checkpoint of the second stage, and the bundle exported from it; beside it that of the first stage alone."""
+    """A checkpoint of the second stage, and the bundle exported from it."""
 
     def make(folder: Path) -> None:
         config = tiny_refine_config(write_first_stage(folder / "first.ckpt"), learning_rate=1e-2)
         last = train(config, write_dataset(folder / "data", 5), folder / "run")
-
-        def export_and_keep(checkpoint: Checkpoint, out: Path, *rest: Any, **options: Any) -> None:
-            export_pillar_bundle(checkpoint, out, *rest, **options)
-            shutil.copytree(out, folder / "first_stage")
-
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(refine_exporter, "export_pillar_bundle", export_and_keep)
-            export_refine_bundle(load_checkpoint(last), folder / "bundle", SCANS)
+        export_refine_bundle(load_checkpoint(last), folder / "bundle", SCANS)
 
     folder = made_once(tmp_path_factory, "refine", make)
     return folder / "run" / "checkpoints" / "last.ckpt", folder / "bundle"
+
+
+def on_first_stage(source: Path, trained: tuple[Path, Path]) -> Checkpoint:
+    """The trained second stage on another first one: the graph of its network is there already."""
+    config = opened_config(source)
+    detector = build_model(config.model)
+    detector.load_state_dict(load_checkpoint(trained[0]).detector.state_dict())
+    return Checkpoint(config, detector.eval(), 0)
 
 
 def test_golden_vectors_of_both_stages(trained: tuple[Path, Path]) -> None:
@@ -72,18 +74,13 @@ def test_train_export_detect(trained: tuple[Path, Path], tmp_path: Path) -> None
     bundle = load_pillar_bundle(folder)
     assert (bundle.kind, set(bundle.graphs)) == ("pillar_refine", set(GRAPHS["pillar_refine"]))
     assert bundle.parity is not None and bundle.parity.scans == len(SCANS) and bundle.refine is not None
-    assert_same_detector(load_checkpoint(last), folder, tmp_path)
+    assert_same_detector(load_checkpoint(last), folder)
 
 
-def test_a_sparse_neck_on_a_pooled_map_proposes(tmp_path: Path) -> None:
+def test_a_sparse_neck_on_a_pooled_map_proposes(trained: tuple[Path, Path], tmp_path: Path) -> None:
     spec = replace(SPEC, grid=replace(SPEC.grid, map="pooled"))
     save_checkpoint(tmp_path / "first.ckpt", tiny_checkpoint("channel", spec, neck="sparse"))
-    config = opened_config(tmp_path / "first.ckpt")
-    torch.manual_seed(0)
-    detector = build_model(config.model)
-    assert isinstance(detector, RefineDetector)
-    checkpoint = Checkpoint(config, detector.eval(), 0)
-    export_refine_bundle(checkpoint, tmp_path / "bundle", SCANS)
+    export_refine_bundle(on_first_stage(tmp_path / "first.ckpt", trained), tmp_path / "bundle", SCANS)
     runtime = Detector(tmp_path / "bundle", score_threshold=0.0, threads=1)
     assert isinstance(runtime.pipeline, RefinePipeline)
     assert runtime.pipeline.stages[2] == "tables" and len(runtime(SCANS[0])) > 0
@@ -112,16 +109,14 @@ def test_the_first_stage_in_eight_bits(trained: tuple[Path, Path], tmp_path: Pat
     assert other.dtype == np.float32 and 0 < np.abs(one - scaled).mean() < 0.1 * np.abs(one).mean()
 
 
-def test_eight_bits_of_other_weights_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_eight_bits_of_other_weights_are_refused(
+    trained: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A bundle's 8-bit form goes by its name; another network may stand there."""
     monkeypatch.chdir(tmp_path)
     save_checkpoint(Path("first.ckpt"), tiny_checkpoint("channel"))
     export_pillar_bundle(tiny_checkpoint("channel"), "first", SCANS, ExportOptions(weights=Path("first.ckpt")))
-    config = opened_config(Path("first"))
-    torch.manual_seed(0)
-    detector = build_model(config.model)
-    assert isinstance(detector, RefineDetector)
-    checkpoint = Checkpoint(config, detector.eval(), 0)
+    checkpoint = on_first_stage(Path("first"), trained)
     with pytest.raises(ExportError, match="0 scans with points on the grid given to calibrate on, at least 8"):
         export_refine_bundle(checkpoint, "out", SCANS, ExportOptions(calibration=SCANS))
     with pytest.raises(BundleError, match="first_int8: no such folder"):
@@ -141,12 +136,6 @@ def test_scans_with_little_or_nothing(trained: tuple[Path, Path]) -> None:
     for points in (np.empty((0, 4)), np.array([[200, 0, 0, 0.5]]), np.array([[10, 0, -1, 0.5]])):
         assert np.isfinite(detector(points.astype(np.float32)).boxes).all()
     assert len(Detector(trained[1], score_threshold=1.0, threads=1)(SCANS[0])) == 0
-
-
-def test_scans_without_a_point_prove_nothing(trained: tuple[Path, Path], tmp_path: Path) -> None:
-    empty = np.empty((0, 4), np.float32)
-    bundle = export_refine_bundle(load_checkpoint(trained[0]), tmp_path / "bundle", [empty, *SCANS])
-    assert bundle.parity is not None and bundle.parity.scans == len(SCANS)
 
 
 def test_folded_norms_change_nothing() -> None:
@@ -181,30 +170,25 @@ def test_the_graph_needs_no_scatter_and_no_normalization(trained: tuple[Path, Pa
         (lambda data: data.update(precision="int8"), "`precision` is not the one that"),
     ],
 )
-def test_manifests_that_were_changed(trained: tuple[Path, Path], tmp_path: Path, change: object, message: str) -> None:
-    for file in trained[1].iterdir():
-        (tmp_path / file.name).write_bytes(file.read_bytes())
-    data = json.loads((tmp_path / MANIFEST).read_text())
-    change(data)  # type: ignore[operator]
-    (tmp_path / MANIFEST).write_text(json.dumps(data))
-    with pytest.raises(BundleError, match=message):
-        load_pillar_bundle(tmp_path)
-
-
-def test_a_refiner_with_other_weights_is_no_parity(
-    trained: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_manifests_that_were_changed(
+    trained: tuple[Path, Path], tmp_path: Path, change: Callable[[Any], object], message: str
 ) -> None:
-    first_stage = trained[1].with_name("first_stage")  # as exported above
-    monkeypatch.setattr(
-        refine_exporter, "export_pillar_bundle", lambda _, out, *rest, **options: shutil.copytree(first_stage, out)
-    )
-    checkpoint = load_checkpoint(trained[0])
-    assert isinstance(checkpoint.detector, RefineDetector)
+    with pytest.raises(BundleError, match=message):
+        load_pillar_bundle(changed_manifest(trained[1], tmp_path / "bundle", change))
+
+
+def test_a_refiner_with_other_weights_is_no_parity(trained: tuple[Path, Path], tmp_path: Path) -> None:
+    checkpoint, bundle = load_checkpoint(trained[0]), load_pillar_bundle(trained[1])
+    detector, pipeline = checkpoint.detector, RefinePipeline(trained[1], bundle, threads=1)
+    assert isinstance(detector, RefineDetector)
+    model = with_first_stage(detector.model)
+    stage = open_exported(model.first_stage)
+    parity = check_refine_parity(detector.refiner, stage, pipeline, model, [np.empty((0, 4), np.float32), SCANS[0]])
+    assert parity.scans == 1, "a scan without a point proves nothing"
     with torch.no_grad():
-        for weight in checkpoint.detector.refiner.head.confidence.parameters():
+        for weight in detector.refiner.head.confidence.parameters():
             weight.fill_(torch.nan)
     with pytest.raises(ExportError, match="part at stage refine `confidence`"):
-        export_refine_bundle(checkpoint, tmp_path / "bundle", SCANS)
-    assert not (tmp_path / "bundle").exists()
+        check_refine_parity(detector.refiner, stage, pipeline, model, SCANS[:1])
     with pytest.raises(ExportError, match="at least 8"):
         export_refine_bundle(checkpoint, tmp_path / "bundle", SCANS[:1])

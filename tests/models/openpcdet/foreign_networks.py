@@ -28,52 +28,60 @@ def write_foreign(path: Path, state: dict[str, Tensor]) -> Path:
     return path
 
 
+def map_layers(
+    channels: int, widths: Sequence[int], convs: Sequence[int], strides: Sequence[int], up: int, *, pad_first: bool
+) -> tuple[nn.ModuleList, nn.ModuleList]:
+    """Blocks and upsamplings of a neck; with `pad_first` a block begins with a padding of zeros, of its own."""
+    blocks, deblocks, total = nn.ModuleList(), nn.ModuleList(), 1
+    for width, count, stride in zip(widths, convs, strides, strict=True):
+        total *= stride
+        layers: list[nn.Module] = [nn.ZeroPad2d(1)] if pad_first else []
+        layers.append(nn.Conv2d(channels, width, 3, stride, padding=0 if pad_first else 1, bias=False))
+        for number in range(count + 1):
+            layers += [nn.BatchNorm2d(width, eps=1e-3), nn.ReLU()]
+            layers += [nn.Conv2d(width, width, 3, padding=1, bias=False)] if number < count else []
+        blocks.append(nn.Sequential(*layers))
+        step = total // strides[0]
+        upsampling = nn.ConvTranspose2d(width, up, step, step, bias=False)
+        deblocks.append(nn.Sequential(upsampling, nn.BatchNorm2d(up, eps=1e-3), nn.ReLU()))
+        channels = width
+    return blocks, deblocks
+
+
+def map_features(blocks: nn.ModuleList, deblocks: nn.ModuleList, features: Tensor) -> Tensor:
+    maps = []
+    for block, deblock in zip(blocks, deblocks, strict=True):
+        features = block(features)
+        maps.append(deblock(features))
+    return torch.cat(maps, dim=1)
+
+
 class MapBackbone(nn.Module):
-    """BaseBEVBackbone: each block begins with a padding of zeros."""
+    """BaseBEVBackbone."""
 
     def __init__(
         self, channels: int, widths: Sequence[int], convs: Sequence[int], strides: Sequence[int], up: int
     ) -> None:
         super().__init__()
-        self.blocks, self.deblocks, total = nn.ModuleList(), nn.ModuleList(), 1
-        for width, count, stride in zip(widths, convs, strides, strict=True):
-            total *= stride
-            layers: list[nn.Module] = [nn.ZeroPad2d(1), nn.Conv2d(channels, width, 3, stride, bias=False)]
-            layers += [nn.BatchNorm2d(width, eps=1e-3), nn.ReLU()]
-            for _ in range(count):
-                layers += [
-                    nn.Conv2d(width, width, 3, padding=1, bias=False),
-                    nn.BatchNorm2d(width, eps=1e-3),
-                    nn.ReLU(),
-                ]
-            self.blocks.append(nn.Sequential(*layers))
-            step = total // strides[0]
-            self.deblocks.append(
-                nn.Sequential(
-                    nn.ConvTranspose2d(width, up, step, step, bias=False), nn.BatchNorm2d(up, eps=1e-3), nn.ReLU()
-                )
-            )
-            channels = width
+        self.blocks, self.deblocks = map_layers(channels, widths, convs, strides, up, pad_first=True)
 
     def forward(self, features: Tensor) -> Tensor:
-        maps = []
-        for block, deblock in zip(self.blocks, self.deblocks, strict=True):
-            features = block(features)
-            maps.append(deblock(features))
-        return torch.cat(maps, dim=1)
+        return map_features(self.blocks, self.deblocks, features)
 
 
 class AnchorHead(nn.Module):
     """AnchorHeadSingle: every anchor has a score for every class."""
 
+    BOXES = "conv_box"
+
     def __init__(self, channels: int, anchors: int, classes: int) -> None:
         super().__init__()
         self.conv_cls = nn.Conv2d(channels, anchors * classes, 1)
-        self.conv_box = nn.Conv2d(channels, anchors * 7, 1)
+        setattr(self, self.BOXES, nn.Conv2d(channels, anchors * 7, 1))
         self.conv_dir_cls = nn.Conv2d(channels, anchors * 2, 1)
 
     def forward(self, features: Tensor) -> list[Tensor]:
-        return [self.conv_cls(features), self.conv_box(features), self.conv_dir_cls(features)]
+        return [layer(features) for layer in self.children()]
 
 
 class PillarLayer(nn.Module):
@@ -119,6 +127,15 @@ def fully_connected(channels: int, hidden: int, out: int | None) -> nn.Sequentia
         layers += [nn.Dropout(0.3)] if number == 0 else []
         channels = hidden
     return nn.Sequential(*layers, *([] if out is None else [nn.Conv1d(channels, out, 1)]))
+
+
+def foreground(channels: int, hidden: int) -> nn.Sequential:
+    """Of the weights of keypoints."""
+    return nn.Sequential(
+        *(nn.Linear(channels, hidden, bias=False), nn.BatchNorm1d(hidden), nn.ReLU()),
+        *(nn.Linear(hidden, hidden, bias=False), nn.BatchNorm1d(hidden), nn.ReLU()),
+        nn.Linear(hidden, 1),
+    )
 
 
 class SparseLayer(nn.Sequential):
@@ -173,11 +190,7 @@ class PvRcnn(nn.Module):
             nn.Linear(joined, keypoint, bias=False), nn.BatchNorm1d(keypoint), nn.ReLU()
         )
         self.point_head = nn.Module()
-        self.point_head.cls_layers = nn.Sequential(
-            *(nn.Linear(joined, weighting, bias=False), nn.BatchNorm1d(weighting), nn.ReLU()),
-            *(nn.Linear(weighting, weighting, bias=False), nn.BatchNorm1d(weighting), nn.ReLU()),
-            nn.Linear(weighting, 1),
-        )
+        self.point_head.cls_layers = foreground(joined, weighting)
         size, radii, mlp, hidden = grid
         self.roi_head = nn.Module()
         self.roi_head.roi_grid_pool_layer = nn.Module()

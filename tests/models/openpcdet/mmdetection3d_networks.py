@@ -7,7 +7,14 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from tests.models.openpcdet.foreign_networks import SparseLayer
+from tests.models.openpcdet.foreign_networks import (
+    AnchorHead,
+    PillarLayer,
+    SparseLayer,
+    foreground,
+    map_features,
+    map_layers,
+)
 
 
 def write_mmdetection3d(path: Path, state: dict[str, Tensor], **meta: Any) -> Path:
@@ -29,98 +36,39 @@ class ConvModule(nn.Module):
         return torch.relu(self.bn(self.conv(features)))
 
 
-class Backbone2d(nn.Module):
-    """SECOND."""
+class MapDetector(nn.Module):
+    """SECOND and SECONDFPN, blocks and upsamplings of one neck in modules of their own."""
 
-    def __init__(self, channels: int, widths: Sequence[int], convs: Sequence[int], strides: Sequence[int]) -> None:
+    backbone: Any
+    neck: Any
+
+    def __init__(
+        self, channels: int, widths: Sequence[int], convs: Sequence[int], strides: Sequence[int], up: int
+    ) -> None:
         super().__init__()
-        self.blocks = nn.ModuleList()
-        for width, count, stride in zip(widths, convs, strides, strict=True):
-            layers: list[nn.Module] = []
-            for number in range(count + 1):
-                step = stride if number == 0 else 1
-                layers.append(nn.Conv2d(width if number else channels, width, 3, step, padding=1, bias=False))
-                layers += [nn.BatchNorm2d(width, eps=1e-3), nn.ReLU()]
-            self.blocks.append(nn.Sequential(*layers))
-            channels = width
+        self.backbone, self.neck = nn.Module(), nn.Module()
+        self.backbone.blocks, self.neck.deblocks = map_layers(channels, widths, convs, strides, up, pad_first=False)
 
-    def forward(self, features: Tensor) -> list[Tensor]:
-        maps = []
-        for block in self.blocks:
-            features = block(features)
-            maps.append(features)
-        return maps
+    def above(self, canvas: Tensor) -> Tensor:
+        return map_features(self.backbone.blocks, self.neck.deblocks, canvas)
 
 
-class Neck(nn.Module):
-    """SECONDFPN."""
-
-    def __init__(self, widths: Sequence[int], up: int, strides: Sequence[int]) -> None:
-        super().__init__()
-        self.deblocks = nn.ModuleList(
-            nn.Sequential(
-                nn.ConvTranspose2d(width, up, step, step, bias=False), nn.BatchNorm2d(up, eps=1e-3), nn.ReLU()
-            )
-            for width, step in zip(widths, strides, strict=True)
-        )
-
-    def forward(self, maps: list[Tensor]) -> Tensor:
-        return torch.cat([deblock(each) for deblock, each in zip(self.deblocks, maps, strict=True)], dim=1)
-
-
-class Anchor3DHead(nn.Module):
+class Anchor3DHead(AnchorHead):
     """Its three 1x1 convolutions."""
 
-    def __init__(self, channels: int, anchors: int, classes: int) -> None:
-        super().__init__()
-        self.conv_cls = nn.Conv2d(channels, anchors * classes, 1)
-        self.conv_reg = nn.Conv2d(channels, anchors * 7, 1)
-        self.conv_dir_cls = nn.Conv2d(channels, anchors * 2, 1)
-
-    def forward(self, features: Tensor) -> list[Tensor]:
-        return [self.conv_cls(features), self.conv_reg(features), self.conv_dir_cls(features)]
+    BOXES = "conv_reg"
 
 
-class PillarLayer(nn.Module):
-    """PFNLayer, the last of one: (P, slots, 10) -> the maximum over all slots, zeros included."""
-
-    def __init__(self, channels: int) -> None:
-        super().__init__()
-        self.linear = nn.Linear(10, channels, bias=False)
-        self.norm = nn.BatchNorm1d(channels, eps=1e-3)
-
-    def forward(self, features: Tensor) -> Tensor:
-        values = self.norm(self.linear(features).permute(0, 2, 1)).permute(0, 2, 1)
-        return torch.relu(values).max(dim=1).values
-
-
-class PointPillars(nn.Module):
+class PointPillars(MapDetector):
     """PillarFeatureNet, SECOND, SECONDFPN and Anchor3DHead."""
 
     voxel_encoder: Any
 
     def __init__(self, channels: int, widths: Sequence[int], convs: Sequence[int], up: int, classes: int) -> None:
-        super().__init__()
+        super().__init__(channels, widths, convs, (2, 2, 2), up)
         self.voxel_encoder = nn.Module()
         self.voxel_encoder.pfn_layers = nn.ModuleList([PillarLayer(channels)])
-        self.backbone = Backbone2d(channels, widths, convs, (2, 2, 2))
-        self.neck = Neck(widths, up, (1, 2, 4))
         self.bbox_head = Anchor3DHead(3 * up, 2 * classes, classes)
-
-
-def pillar_features(points: Tensor, counts: Tensor, centers: Tensor, *, legacy: bool) -> Tensor:
-    """Features (P, slots, 10) of padded points (P, slots, 4), of which pillar i has counts[i] and its center.
-
-    With `legacy` the offsets to the center are written over x, y and z, before these are joined with the others.
-    """
-    points = points.clone()
-    mean = points[:, :, :3].sum(dim=1, keepdim=True) / counts[:, None, None]
-    from_mean = points[:, :, :3] - mean
-    from_center = points[:, :, :3] - centers[:, None]
-    if legacy:
-        points[:, :, :3] = from_center
-    present = torch.arange(points.shape[1])[None, :, None] < counts[:, None, None]
-    return torch.cat([points, from_mean, from_center], dim=2) * present
 
 
 def set_abstraction(channels: int, radii: int, widths: Sequence[int]) -> nn.Module:
@@ -142,7 +90,7 @@ def fully_connected(channels: int, hidden: int, out: int | None) -> nn.Sequentia
     return nn.Sequential(*layers, *([] if out is None else [nn.Conv2d(hidden, out, 1)]))
 
 
-class PvRcnn(nn.Module):
+class PvRcnn(MapDetector):
     """SparseEncoder, SECOND, SECONDFPN, PartA2RPNHead, VoxelSetAbstraction and PVRCNNRoiHead.
 
     Args:
@@ -169,7 +117,7 @@ class PvRcnn(nn.Module):
         weighting: int,
         grid: tuple[int, int, Sequence[int], int],
     ) -> None:
-        super().__init__()
+        super().__init__(2 * widths[4], neck[0], neck[1], (1, 2), neck[2])
         self.middle_encoder = nn.Module()
         self.middle_encoder.conv_input = SparseLayer(4, widths[0], (3, 3, 3))
         self.middle_encoder.encoder_layers = nn.Module()
@@ -178,8 +126,6 @@ class PvRcnn(nn.Module):
             layers = nn.Sequential(*(SparseLayer(read, widths[stage], (3, 3, 3)) for read in reads))
             setattr(self.middle_encoder.encoder_layers, f"encoder_layer{stage + 1}", layers)
         self.middle_encoder.conv_out = SparseLayer(widths[3], widths[4], (3, 1, 1))
-        self.backbone = Backbone2d(2 * widths[4], neck[0], neck[1], (1, 2))
-        self.neck = Neck(neck[0], neck[2], (1, 2))
         self.rpn_head = Anchor3DHead(2 * neck[2], 2 * classes, classes)
         self.points_encoder = nn.Module()
         self.points_encoder.rawpoints_sa_layer, *others = (set_abstraction(*each) for each in balls)
@@ -188,11 +134,7 @@ class PvRcnn(nn.Module):
         self.points_encoder.point_feature_fusion_layer = nn.Sequential(ConvModule(joined, keypoint))
         self.roi_head = nn.Module()
         self.roi_head.semantic_head = nn.Module()
-        self.roi_head.semantic_head.seg_cls_layer = nn.Sequential(
-            *(nn.Linear(joined, weighting, bias=False), nn.BatchNorm1d(weighting), nn.ReLU()),
-            *(nn.Linear(weighting, weighting, bias=False), nn.BatchNorm1d(weighting), nn.ReLU()),
-            nn.Linear(weighting, 1),
-        )
+        self.roi_head.semantic_head.seg_cls_layer = foreground(joined, weighting)
         size, radii, mlp, hidden = grid
         self.roi_head.bbox_roi_extractor = nn.Module()
         self.roi_head.bbox_roi_extractor.roi_grid_pool_layer = set_abstraction(keypoint, radii, mlp)

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F  # noqa: N812  (torch's own convention)
 
+from asca_pillars.config.pv_rcnn import PvRcnnModel
 from asca_pillars.config.tree import Config
 from asca_pillars.models.pv_rcnn.layers import PvRcnn as OurNetwork
 from asca_pillars.models.pv_rcnn.network import PvRcnnDetector
@@ -101,13 +102,10 @@ def voxel_volumes(blocks: Sequence[Sequence[Any]], scans: Any) -> list[Tensor]:
 
 
 CONFIG = Config(name="foreign", model=MODEL)
-
-
 LAYOUTS = {"1.x": (2, 3, 4, 1, 0), "2.x, native": (2, 3, 4, 0, 1), "2.x": (0, 2, 3, 4, 1)}
 """Of a dense kernel (out, in, z, y, x), the order in which spconv has its axes."""
-
-
 CHANNELS = {"points": 1, "conv2": 6, "conv4": 8}
+PUBLISHED_CHANNELS = {"points": 1, "conv1": 16, "conv2": 32, "conv3": 64, "conv4": 64}
 
 
 def in_layout(state: dict[str, Tensor], layout: str, prefix: str = "backbone_3d") -> dict[str, Tensor]:
@@ -116,3 +114,15 @@ def in_layout(state: dict[str, Tensor], layout: str, prefix: str = "backbone_3d"
         name: value.permute(axes).contiguous() if name.startswith(prefix) and value.ndim == 5 else value
         for name, value in state.items()
     }
+
+
+def foreign_pv_rcnn(kind: Callable[..., Any], model: PvRcnnModel = MODEL, channels: dict[str, int] = CHANNELS) -> Any:
+    """Somebody else's PV-RCNN of this kind, of the sizes of our model."""
+    network, settings = model.network, model.settings
+    balls = [
+        (channels[each.source], len(each.radii_m), widths)
+        for each, widths in zip(settings.sources, network.source_widths, strict=True)
+    ]
+    neck = network.block_channels, network.block_convs, network.upsample_channels
+    grid = settings.grid_size, len(settings.grid_radii_m), network.grid_widths, network.hidden
+    return kind(network.voxel_channels, neck, 3, balls, network.keypoint_channels, network.weighting_channels, grid)

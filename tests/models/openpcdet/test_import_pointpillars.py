@@ -1,10 +1,9 @@
 """OpenPCDet's PointPillars, imported: the same values after every part, then a bundle that finds the same boxes."""
 
-import dataclasses
+import math
 import pickle
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 
@@ -13,16 +12,13 @@ from asca_export.pillar.export import export_pillar_bundle
 from asca_pillars.base.errors import BundleError, ConfigError, TrainingError
 from asca_pillars.config.pillar import PillarModel
 from asca_pillars.config.tree import Config, load_config
-from asca_pillars.detection.decode import HeadMaps, PostProcess
 from asca_pillars.models.checkpoint import Checkpoint, load_checkpoint
 from asca_pillars.models.openpcdet.import_checkpoint import published_config, read_foreign, write_imported
 from asca_pillars.models.pillar.network import PillarDetector
-from asca_pillars.models.pillar.preparation import batch_pillars
-from asca_pillars.ops.pillar.prepare import Pillars
 from tests.export.deployed import assert_same_detector
 from tests.export.tiny import SCANS
 from tests.models.openpcdet.foreign_networks import PointPillars, random_weights, write_foreign
-from tests.models.openpcdet.small_pointpillars import GRID, NETWORK, SLOTS, SPEC
+from tests.models.openpcdet.small_pointpillars import NETWORK, SPEC, assert_same_boxes, assert_same_parts, padded
 
 CONFIG = Config(name="foreign", model=PillarModel(spec=SPEC, network=NETWORK))
 
@@ -43,80 +39,23 @@ def imported(foreign: PointPillars, tmp_path_factory: pytest.TempPathFactory) ->
     return load_checkpoint(folder / "ours.ckpt")
 
 
-def padded(pillars: Pillars) -> torch.Tensor:
-    """(P, slots, 10) as PillarVFE makes them of kept points: from coordinates and indices alone, zeros behind them."""
-    found = np.zeros((len(pillars.cells), SLOTS, 10), np.float32)
-    for pillar, cell in enumerate(pillars.cells):
-        points = pillars.features[pillars.pillar_index == pillar, :4]
-        row, column = divmod(int(cell), GRID.nx)
-        center = 4.8 + (column + 0.5) * 0.32, -6.4 + (row + 0.5) * 0.32, (1.5 - 3.0) / 2
-        found[pillar, : len(points)] = np.hstack(
-            [points, points[:, :3] - points[:, :3].mean(0), points[:, :3] - center]
-        )
-    return torch.from_numpy(found)
-
-
-def detector_of(checkpoint: Checkpoint) -> PillarDetector:
-    assert isinstance(checkpoint.detector, PillarDetector)
-    return checkpoint.detector
-
-
 def test_every_part_gives_what_theirs_gives(foreign: PointPillars, imported: Checkpoint) -> None:
-    detector, pillars = detector_of(imported), SPEC.pillarize(SCANS[0])
-    full = pillars.point_counts == SLOTS
-    assert full.any() and not full.all(), "pillars with empty slots and without"
-    batch = batch_pillars([pillars])
-    with torch.inference_mode():
-        theirs = foreign.vfe.pfn_layers[0](padded(pillars))
-        ours = detector.encode(batch.features, batch.pillar_index, batch.point_counts)
-        torch.testing.assert_close(ours, theirs, atol=1e-4, rtol=1e-4)
-        canvas = torch.zeros(GRID.ny * GRID.nx, 12)
-        canvas[torch.from_numpy(pillars.cells)] = theirs
-        features = foreign.backbone_2d(canvas.T.reshape(1, 12, GRID.ny, GRID.nx))
-        torch.testing.assert_close(detector.neck(detector.scatter(ours, batch.cells, batch.frame_cells)), features)
-        for name, ours_map, their_map in zip(
-            HeadMaps._fields, detector(batch), foreign.dense_head(features), strict=True
-        ):
-            torch.testing.assert_close(ours_map, their_map, atol=1e-4, rtol=1e-4, msg=name)
+    assert isinstance(imported.detector, PillarDetector)
+    layer = foreign.vfe.pfn_layers[0]
+    assert_same_parts(imported.detector, lambda each: layer(padded(each)), foreign.backbone_2d, foreign.dense_head)
 
 
 def test_boxes_are_decoded_as_theirs() -> None:
-    height, width = GRID.head_shape
-    rng = np.random.default_rng(0)
-    maps = HeadMaps(*(rng.normal(0, 0.5, (6 * size, height, width)).astype(np.float32) for size in (3, 7, 2)))
-    scores, residuals, directions = (
-        part.transpose(1, 2, 0).reshape(height, width, 3, 2, -1)
-        for part in maps  # size of the anchor, then its yaw
-    )
-    best = np.sort(scores.max(axis=-1).reshape(-1))[-20]
-    spec = dataclasses.replace(SPEC, post=PostProcess(nms_iou=1.0, max_detections=1000))
-    found = spec.with_score_threshold(float(1 / (1 + np.exp(-best.astype(np.float64) + 1e-6)))).decode(maps)
-    expected = []
-    for y, x, size, turned in np.argwhere(scores.max(axis=-1) >= best):
-        anchor, residual = SPEC.classes[size], residuals[y, x, size, turned]
-        # Anchors from end to end of the range, on their feet; the direction bin has the half circle from 45 degrees on.
-        center = 4.8 + x * 20.48 / (width - 1), -6.4 + y * 15.36 / (height - 1), anchor.z_m
-        dims = np.array([anchor.length_m, anchor.width_m, anchor.height_m])
-        diagonal = np.hypot(dims[0], dims[1])
-        yaw = residual[6] + turned * np.pi / 2 - np.pi / 4
-        yaw = yaw - np.floor(yaw / np.pi) * np.pi + np.pi / 4 + np.pi * directions[y, x, size, turned].argmax()
-        place = center + residual[:3] * [diagonal, diagonal, dims[2]]
-        label = scores[y, x, size, turned].argmax()
-        expected.append([label, *place, *(dims * np.exp(residual[3:6])), np.sin(yaw), np.cos(yaw)])
-    yaws = found.boxes[:, 6:]
-    ours = np.hstack([found.labels[:, None], found.boxes[:, :6], np.sin(yaws), np.cos(yaws)])
-    assert len(ours) == len(expected) == 20 and len(set(found.labels)) > 1
-    wanted_rows = np.array(expected)
-    np.testing.assert_allclose(
-        ours[np.lexsort(ours.T[1:3])], wanted_rows[np.lexsort(wanted_rows.T[1:3])], atol=2e-3, rtol=1e-4
-    )
+    """Anchors from end to end of the range; a direction bin has the half circle from 45 degrees on."""
+    anchors = [(3.9, 1.6, 1.56, -1.78), (0.8, 0.6, 1.73, -0.6 - 1.73 / 2), (1.76, 0.6, 1.73, -0.6 - 1.73 / 2)]
+    assert_same_boxes(SPEC, lambda count, low, high: torch.linspace(low, high, count), anchors, math.pi / 4)
 
 
 def test_it_runs_as_a_bundle(imported: Checkpoint, tmp_path: Path) -> None:
     bundle = export_pillar_bundle(imported, tmp_path / "bundle", SCANS)
     assert bundle.parity is not None and bundle.provenance.steps == 18560
     assert bundle.spec.anchor_places == "ends" and bundle.spec.anchor_scores == "every"
-    assert_same_detector(imported, tmp_path / "bundle", tmp_path)
+    assert_same_detector(imported, tmp_path / "bundle")
     with pytest.raises(BundleError, match="anchor_places ends, anchor_scores every; the page runs anchors at cell"):
         write_page(tmp_path / "page", tmp_path / "bundle", tmp_path / "scan.npy", tmp_path)
 

@@ -1,6 +1,5 @@
 """OpenPCDet's PV-RCNN, imported from both versions of spconv: the same values after every part."""
 
-import dataclasses
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -9,38 +8,27 @@ import pytest
 import torch
 from torch import Tensor
 
-from asca_pillars.base.errors import ConfigError, TrainingError
 from asca_pillars.config.pv_rcnn import PvRcnnModel
-from asca_pillars.config.tree import Config, load_config
+from asca_pillars.config.tree import load_config
 from asca_pillars.models.checkpoint import load_checkpoint
 from asca_pillars.models.openpcdet.import_checkpoint import published_config, read_foreign, write_imported
 from asca_pillars.models.pv_rcnn.layers import PvRcnn as OurNetwork
 from asca_pillars.models.pv_rcnn.network import PvRcnnDetector
 from tests.models.openpcdet.foreign_networks import PvRcnn, random_weights, write_foreign
-from tests.models.openpcdet.small_pv_rcnn import CHANNELS, CONFIG, LAYOUTS, MODEL, Parts, assert_same_parts, in_layout
-from tests.models.pv_rcnn.tiny_pv_rcnn import NETWORK
-
-
-def foreign_network(model: PvRcnnModel = MODEL, channels: dict[str, int] = CHANNELS) -> PvRcnn:
-    network, settings = model.network, model.settings
-    balls = [
-        (channels[each.source], len(each.radii_m), widths)
-        for each, widths in zip(settings.sources, network.source_widths, strict=True)
-    ]
-    return PvRcnn(
-        network.voxel_channels,
-        (network.block_channels, network.block_convs, network.upsample_channels),
-        3,
-        balls,
-        network.keypoint_channels,
-        network.weighting_channels,
-        (settings.grid_size, len(settings.grid_radii_m), network.grid_widths, network.hidden),
-    )
+from tests.models.openpcdet.small_pv_rcnn import (
+    CONFIG,
+    LAYOUTS,
+    PUBLISHED_CHANNELS,
+    Parts,
+    assert_same_parts,
+    foreign_pv_rcnn,
+    in_layout,
+)
 
 
 @pytest.fixture(scope="module")
 def foreign() -> Any:
-    return random_weights(foreign_network())
+    return random_weights(foreign_pv_rcnn(PvRcnn))
 
 
 def imported(foreign: PvRcnn, folder: Path, layout: str = "1.x") -> OurNetwork:
@@ -85,32 +73,10 @@ def test_every_part_gives_what_theirs_gives(foreign: PvRcnn, tmp_path: Path) -> 
     assert_same_parts(parts, ours)
 
 
-def test_what_does_not_fit_is_named(foreign: PvRcnn, tmp_path: Path) -> None:
-    state = foreign.state_dict()
-    gated = dataclasses.replace(MODEL, network=dataclasses.replace(NETWORK, gate="keypoint"))
-    for changes, config, message in (
-        (
-            {},
-            Config(name="gated", model=gated),
-            "OpenPCDet's model has no encode.gates.0.gate.weight; switch off what gated",
-        ),
-        (
-            {},
-            load_config("pv_rcnn_kitti"),
-            "lacks backbone_2d.blocks.0.10.weight, .* and 95 more; the network of --config",
-        ),
-        ({"roi_head.more": torch.zeros(1)}, CONFIG, "roi_head.more: no place for it"),
-        ({"backbone_3d.conv2.0.0.weight": torch.zeros(3, 3)}, CONFIG, r"conv2\.0\.0\.weight has shape \(3, 3\)"),
-    ):
-        weights = read_foreign(write_foreign(tmp_path / "theirs.pth", state | changes))
-        with pytest.raises((TrainingError, ConfigError), match=message):
-            write_imported(weights, config, tmp_path / "ours.ckpt")
-
-
 def test_the_published_model_fits(tmp_path: Path) -> None:
     config = load_config("pv_rcnn_kitti")
     assert isinstance(config.model, PvRcnnModel)
-    published = foreign_network(config.model, {"points": 1, "conv1": 16, "conv2": 32, "conv3": 64, "conv4": 64})
+    published = foreign_pv_rcnn(PvRcnn, config.model, PUBLISHED_CHANNELS)
     assert sum(weight.numel() for weight in published.parameters()) == 13_115_697
     weights = read_foreign(write_foreign(tmp_path / "theirs.pth", in_layout(published.state_dict(), "2.x")))
     write_imported(weights, config, tmp_path / "ours.ckpt")

@@ -1,4 +1,4 @@
-"""The loss against hand-derived numbers and plain formulas, and the way targets -> maps -> loss and decode closed."""
+"""The loss against plain formulas and by hand, scores that say how well boxes fit, and targets -> maps -> decode."""
 
 import dataclasses
 import math
@@ -6,12 +6,28 @@ import math
 import numpy as np
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from torch import Tensor
 
-from asca_pillars.config.pillar import LossConfig
+from asca_pillars.config.pillar import LossConfig, PillarModel
 from asca_pillars.detection.decode import HeadMaps
-from asca_pillars.geometry.boxes import wrap_angle
-from asca_pillars.models.pillar.loss import LossTerms, box_loss, detection_loss, focal_loss
-from tests.helpers.scenes import SPEC
+from asca_pillars.geometry.boxes import decode_boxes, wrap_angle
+from asca_pillars.geometry.overlap import iou_3d
+from asca_pillars.models.pillar.loss import (
+    LossTerms,
+    TargetBatch,
+    box_loss,
+    detection_loss,
+    focal_loss,
+    overlaps_found,
+    quality_focal_loss,
+    states_by_class,
+)
+from asca_pillars.models.pillar.network import build_pillar_detector
+from asca_pillars.models.pillar.preparation import LabeledPillars, batch_pillars, batch_targets
+from tests.helpers.scenes import SPEC, make_scene
+from tests.helpers.tiny_run import NETWORK
 from tests.models.pillar.loss_scenes import (
     COLUMNS,
     COUNT,
@@ -23,36 +39,28 @@ from tests.models.pillar.loss_scenes import (
     scene_targets,
 )
 
-CONFIG = LossConfig()
+CONFIG, IOU = LossConfig(), LossConfig(score_target="iou")
 
 
-def test_focal_loss_by_hand() -> None:
-    """Eq. (14), -alpha_t (1 - p_t)^2 ln p_t, alpha_t 0.25 for an object and 0.75 for background.
-
-    Logit 0 is p = 1/2:          object 0.25 * 1/4 * ln 2       = 0.0433217, background 0.75 * 1/4 * ln 2  = 0.1299651.
-    Logit ln 3 is p = 3/4:       object 0.25 * 1/16 * ln(4/3)   = 0.0044950, background 0.75 * 9/16 * ln 4 = 0.5848429.
-    """
-    logits = torch.tensor([0.0, 0.0, math.log(3), math.log(3)])
-    found = [
-        focal_loss(logits[i : i + 1], torch.tensor([state], dtype=torch.int8), 0.25, 2.0).item()
-        for i, state in enumerate((1, 0, 1, 0))
-    ]
-    np.testing.assert_allclose(found, [0.0433217, 0.1299651, 0.0044950, 0.5848429], rtol=1e-5)
-
-
-@pytest.mark.parametrize(("alpha", "gamma"), [(0.25, 2.0), (0.6, 1.0), (0.5, 0.0)])
-def test_focal_loss_equals_the_plain_formula(alpha: float, gamma: float) -> None:
+@pytest.mark.parametrize(("alpha", "gamma"), [(0.25, 2.0), (0.6, 1.0), (0.5, 0.0), (0.3, 1.5)])
+def test_focal_losses_are_the_plain_formulas(alpha: float, gamma: float) -> None:
+    """Eq. (14), -alpha_t (1 - p_t)^gamma ln p_t, where an object of quality y has |y - p|^gamma times the entropy."""
     rng = np.random.default_rng(1)
-    logits, state = rng.normal(0, 3, (2, 5, 4, 6)), rng.integers(-1, 2, (2, 5, 4, 6))
-    expected = 0.0
-    for logit, wanted in zip(logits.flat, state.flat, strict=True):
-        p = 1 / (1 + math.exp(-logit))
-        if wanted == 1:
-            expected -= alpha * (1 - p) ** gamma * math.log(p)
-        elif wanted == 0:
-            expected -= (1 - alpha) * p**gamma * math.log(1 - p)
-    found = focal_loss(torch.from_numpy(logits), torch.from_numpy(state.astype(np.int8)), alpha, gamma)
-    assert found.item() == pytest.approx(expected, rel=1e-6)
+    logits, states, qualities = rng.normal(0, 3, (40, 3)), rng.integers(-1, 2, (40, 3)), rng.uniform(0, 1, (40, 1))
+    given = torch.from_numpy(logits), torch.from_numpy(states.astype(np.int8))
+
+    def expected(qualities: np.ndarray) -> float:
+        total = 0.0
+        for place in np.ndindex(logits.shape):
+            p, y = 1 / (1 + math.exp(-logits[place])), qualities[place[0], 0] if states[place] == 1 else 0.0
+            if states[place] >= 0:
+                weight = alpha if states[place] == 1 else 1 - alpha
+                total -= weight * abs(y - p) ** gamma * ((1 - y) * math.log(1 - p) + y * math.log(p))
+        return total
+
+    found = quality_focal_loss(*given, torch.from_numpy(qualities), alpha, gamma).item()
+    assert found == pytest.approx(expected(qualities), rel=1e-6)
+    assert focal_loss(*given, alpha, gamma).item() == pytest.approx(expected(np.ones((40, 1))), rel=1e-6)
 
 
 def test_focal_loss_of_extreme_logits() -> None:
@@ -65,15 +73,22 @@ def test_focal_loss_of_extreme_logits() -> None:
     np.testing.assert_allclose(logits.grad.numpy(), [0, 0, 0.75, -0.25], atol=1e-6)
 
 
-def test_ignored_anchors_take_no_part() -> None:
-    logits = torch.randn(3, 4, 5, 6, generator=torch.Generator().manual_seed(0)).requires_grad_()
-    state = torch.from_numpy(np.random.default_rng(0).integers(-1, 2, (3, 4, 5, 6)).astype(np.int8))
-    loss = focal_loss(logits, state, 0.25, 2.0)
+@pytest.mark.parametrize("gamma", [2.0, 1.5])
+def test_gradients_of_the_quality_loss_are_those_of_finite_differences(gamma: float) -> None:
+    generator = torch.Generator().manual_seed(0)
+    logits = torch.randn(12, 3, generator=generator, dtype=torch.float64, requires_grad=True)
+    states = torch.randint(-1, 2, (12, 3), generator=generator, dtype=torch.int8)
+    quality = torch.rand(12, 1, generator=generator, dtype=torch.float64)
+    assert torch.autograd.gradcheck(lambda x: quality_focal_loss(x, states, quality, 0.25, gamma), logits)
+
+
+@pytest.mark.parametrize("gamma", [2.0, 1.0, 0.0])
+def test_extreme_logits_and_exact_scores_have_finite_gradients(gamma: float) -> None:
+    logits = torch.tensor([1e4, -1e4, 1e4, -1e4, 0.0])[:, None].requires_grad_()
+    states = torch.tensor([1, 0, 0, 1, 1], dtype=torch.int8)[:, None]
+    loss = quality_focal_loss(logits, states, torch.tensor([1.0, 0, 0, 0.5, 0.5])[:, None], 0.25, gamma)
     loss.backward()
-    assert logits.grad is not None
-    assert (logits.grad[state == -1] == 0).all() and (logits.grad[state >= 0] != 0).all()
-    changed = torch.where(state == -1, torch.full_like(logits, 50.0), logits)
-    assert focal_loss(changed, state, 0.25, 2.0).item() == loss.item()
+    assert logits.grad is not None and logits.grad.isfinite().all() and loss.isfinite()
 
 
 def test_box_loss_by_hand() -> None:
@@ -91,18 +106,6 @@ def test_box_loss_by_hand() -> None:
     found = [box_loss(residuals[i : i + 1], targets[i : i + 1], 1 / 9).item() for i in range(4)]
     np.testing.assert_allclose(found, [0.01125, 0.944444, 0.944444, 0.444444], rtol=1e-5)
     assert box_loss(residuals, targets, 1 / 9).item() == pytest.approx(sum(found))
-
-
-def test_half_a_turn_is_a_matter_of_direction_alone() -> None:
-    _, _, targets = scene_targets(0)
-    batch, right = batched([targets]), perfect_maps([targets])
-    half_turn = torch.zeros(7 * COUNT)
-    half_turn[6::7] = math.pi
-    turned = right._replace(boxes=right.boxes + half_turn[:, None, None])
-    assert detection_loss(turned, batch, CONFIG).box.item() == pytest.approx(0, abs=1e-9)
-    swapped = right._replace(directions=-right.directions)  # the other bin is ahead by the margin of 30
-    terms = detection_loss(swapped, batch, CONFIG)
-    assert terms.box.item() == 0 and terms.direction.item() == pytest.approx(0.2 * 30)
 
 
 def test_direction_by_hand() -> None:
@@ -183,3 +186,79 @@ def test_half_precision_maps_are_summed_in_full() -> None:
     expected = detection_loss(HeadMaps(*(part.float() for part in maps)), batched([frame]), CONFIG)
     for term, other in zip(terms, expected, strict=True):
         assert term.dtype == torch.float32 and term.item() == other.item()
+
+
+def positive_rows(maps: HeadMaps[Tensor], targets: TargetBatch) -> tuple[Tensor, Tensor]:
+    """Residuals (n, 7) and logits (n,) of the positive anchors of whole maps."""
+    boxes = maps.boxes.permute(0, 2, 3, 1).reshape(-1, 7)
+    scores = maps.scores.permute(0, 2, 3, 1).reshape(-1)
+    return boxes[targets.positives], scores[targets.positives]
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_overlaps_are_those_of_the_decoded_boxes(seed: int) -> None:
+    boxes, _, targets = scene_targets(seed % 20)
+    batch = batched([targets])
+    noise = torch.randn(batch.residuals.shape, generator=torch.Generator().manual_seed(seed))
+    residuals = (batch.residuals + 0.2 * noise).requires_grad_()
+    found = overlaps_found(residuals, batch)
+    assert found.dtype == torch.float32 and not found.requires_grad
+    predicted = decode_boxes(residuals.detach().numpy(), targets.directions, targets.anchors)
+    expected = iou_3d(predicted, boxes)[np.arange(len(predicted)), targets.matched]
+    np.testing.assert_allclose(found.numpy(), expected, atol=1e-4)
+
+
+def test_what_overflows_overlaps_nothing() -> None:
+    batch = batched([scene_targets(0)[2]])
+    for value in (math.nan, math.inf, -math.inf, 1e38):
+        found = overlaps_found(torch.full_like(batch.residuals, value), batch)
+        assert not found.any()
+
+
+@pytest.mark.parametrize("scores", [1, 3])
+def test_the_class_term_is_that_of_the_overlaps(scores: int) -> None:
+    """With a score for each class the overlap is wanted in the column of the anchor's own class alone."""
+    frames = [scene_targets(seed)[2] for seed in (6, 7)]
+    maps, batch = noisy_maps(2), batched(frames)
+    maps = maps._replace(
+        boxes=(perfect_maps(frames).boxes + 0.1 * maps.boxes).detach(), scores=maps.scores.repeat(1, scores, 1, 1)
+    )
+    terms, plain = detection_loss(maps, batch, IOU), detection_loss(maps, batch, CONFIG)
+    assert (terms.box, terms.direction) == (plain.box, plain.direction)
+    found = terms.classification.item() * len(batch.positives)
+    states = states_by_class(batch.state, scores)
+    rows = maps.scores.permute(0, 2, 3, 1).reshape(-1, scores)
+    background = focal_loss(torch.where(states == 1, -1e4, rows), torch.where(states == 1, 0, states), 0.25, 2.0)
+    overlaps = overlaps_found(positive_rows(maps, batch)[0], batch)
+    assert 0.05 < overlaps.mean() < 0.95
+    own = batch.positives % COUNT // 2 if scores == 3 else torch.zeros_like(batch.positives)
+    logits = rows[batch.positives, own][:, None]
+    objects = quality_focal_loss(logits, torch.ones_like(logits, dtype=torch.int8), overlaps[:, None], 0.25, 2.0)
+    assert found == pytest.approx((background + objects).item(), rel=1e-5)
+
+
+def test_boxes_do_not_learn_from_the_class_term() -> None:
+    frame = scene_targets(6)[2]
+    maps = noisy_maps(1)
+    detection_loss(maps, batched([frame]), IOU).classification.backward()
+    assert maps.boxes.grad is None and maps.directions.grad is None and maps.scores.grad is not None
+
+
+def test_one_frame_is_learnt_until_scores_say_how_well_boxes_fit() -> None:
+    """Without the box term boxes stay about their anchors, which fit some objects well and others badly."""
+    torch.manual_seed(0)
+    model = PillarModel(spec=SPEC, network=NETWORK, loss=dataclasses.replace(IOU, box_weight=0))
+    detector = build_pillar_detector(model)
+    points, _, _ = make_scene(0)
+    targets = scene_targets(0)[2]
+    batch = LabeledPillars(batch_pillars([SPEC.pillarize(points)]), batch_targets([targets]))
+    optimizer = torch.optim.Adam(detector.parameters(), lr=3e-3)
+    for _ in range(80):
+        optimizer.zero_grad()
+        torch.stack(list(detector.loss(detector.predict(batch), batch).values())).sum().backward()
+        optimizer.step()
+    with torch.no_grad():
+        residuals, logits = positive_rows(detector(batch.pillars), batch.targets)
+    overlaps, scores = overlaps_found(residuals, batch.targets), torch.sigmoid(logits)
+    assert overlaps.std() > 0.05
+    assert (scores - overlaps).abs().max() < 0.03

@@ -8,9 +8,10 @@ import torch
 
 from asca_pillars.config.pillar import CpaReading, NetworkConfig, PillarModel
 from asca_pillars.data.frames import LabeledFrame
+from asca_pillars.models.map_backbone import as_map
 from asca_pillars.models.pillar.neck import RPNNeck
 from asca_pillars.models.pillar.network import PillarDetector, build_pillar_detector
-from asca_pillars.models.pillar.preparation import PillarBatch, batch_pillars
+from asca_pillars.models.pillar.preparation import batch_pillars
 from asca_pillars.ops.pillar.grid import PillarGrid
 from asca_pillars.ops.pillar.spec import PillarSpec
 
@@ -27,16 +28,6 @@ def _points(count: int = 600, seed: int = 0) -> np.ndarray:
     rng = np.random.default_rng(seed)
     low, high = (4.8, -7.68, -2.0, 0.0), (20.16, 12.8, 0.5, 1.0)
     return rng.uniform(low, high, (count, 4)).astype(np.float32)
-
-
-def test_shapes_follow_the_grid() -> None:
-    height, width = SPEC.grid.head_shape
-    assert (SPEC.grid.ny, SPEC.grid.nx) == (128, 112) and (height, width) == (64, 56)
-    batch = batch_pillars([SPEC.pillarize(_points(seed=1)), SPEC.pillarize(_points(seed=2))])
-    maps = _detector()(batch)
-    assert maps.scores.shape == (2, 6, height, width)
-    assert maps.boxes.shape == (2, 42, height, width)
-    assert maps.directions.shape == (2, 12, height, width)
 
 
 def test_neck_has_table_1s_widths_and_size() -> None:
@@ -99,13 +90,6 @@ def test_scans_of_a_point_or_a_cell_are_learnt_from(neck: Literal["dense", "spar
         assert sum(float(weight.grad.abs().sum()) for weight in detector.parameters() if weight.grad is not None) > 0
 
 
-def test_a_frame_does_not_depend_on_its_batch() -> None:
-    detector = _detector()
-    frames = [SPEC.pillarize(_points(seed=seed)) for seed in (1, 2)]
-    together, alone = detector(batch_pillars(frames)), detector(batch_pillars(frames[1:]))
-    torch.testing.assert_close(together.boxes[1], alone.boxes[0], rtol=1e-3, atol=1e-5)
-
-
 @pytest.mark.parametrize(("row", "column"), [(3, 2), (30, 40), (60, 55), (31, 8)])
 def test_a_pillar_excites_the_feature_cell_whose_anchor_stands_over_it(row: int, column: int) -> None:
     """The shortest path (Block1, DeBlock1) is traced: the strongest answer is at the anchor nearest to the pillar."""
@@ -126,16 +110,13 @@ def test_a_pillar_excites_the_feature_cell_whose_anchor_stands_over_it(row: int,
     np.testing.assert_allclose(SPEC.anchors[row, column, 0, :2], pillar_center, atol=1e-4)
 
 
-def test_pillar_batch_moves_indices_by_the_pillars_before() -> None:
-    frames = [SPEC.pillarize(_points(40, seed)) for seed in (1, 2, 3)]
-    batch: PillarBatch = batch_pillars(frames)
-    assert batch.frame_pillars == [len(frame.cells) for frame in frames]
-    assert torch.equal(torch.bincount(batch.pillar_index), batch.point_counts)
-    assert np.array_equal(np.concatenate([frame.cells for frame in frames]), batch.cells.numpy())
-
-
-def test_config_without_attention_and_with_one_zone_is_pointpillars() -> None:
-    spec = PillarSpec(grid=PillarGrid(zones=1, v_max_m=0.16))
-    detector = build_pillar_detector(PillarModel(spec=spec, network=NetworkConfig(cpa="none")))
-    assert (detector.grid.ny, detector.grid.nx) == (496, 432)
-    assert detector.encode.pillar_attention is None and detector.encode.point_attention is None
+@pytest.mark.parametrize(("capability", "copied"), [("AVX2", True), ("AVX512", False), ("DEFAULT", False)])
+def test_a_map_has_its_channels_first_and_is_copied_where_gradients_are_slow_otherwise(
+    capability: str, copied: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(torch.backends.cpu, "get_cpu_capability", lambda: capability)
+    cells = torch.arange(2 * 3 * 4 * 5.0).view(2, 3, 4, 5)
+    found = as_map(cells)
+    assert found.shape == (2, 5, 3, 4)
+    assert torch.equal(found[1, :, 2, 3], cells[1, 2, 3])
+    assert found.is_contiguous() == copied

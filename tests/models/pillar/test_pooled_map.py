@@ -46,13 +46,6 @@ def test_frames_are_pooled_as_the_runtime_does_and_stay_apart(neck: Literal["den
     torch.testing.assert_close(together[-len(alone) :], alone, rtol=0, atol=1e-5)
 
 
-def test_a_batch_without_placements_is_no_input() -> None:
-    batch = batch_pillars([POOLED.pillarize(make_scene(0)[0])])
-    for neck in ("dense", "sparse"):
-        with pytest.raises(ValueError, match="placed for another map or neck"):
-            make_detector(neck)(batch)
-
-
 def test_gradients_reach_every_pillar_that_is_largest_somewhere() -> None:
     detector = make_detector("sparse").train()
     frame = POOLED.pillarize(make_scene(0)[0])

@@ -11,20 +11,13 @@ import torch
 
 from asca_pillars.base.errors import ConfigError
 from asca_pillars.config.pillar import LossConfig, NetworkConfig, PillarModel
-from asca_pillars.detection.targets import assign_targets
-from asca_pillars.models.pillar.loss import TargetBatch, detection_loss, targets_at
+from asca_pillars.models.pillar.loss import TargetBatch, detection_loss
 from asca_pillars.models.pillar.neck import RPNNeck, SparseRPNNeck
 from asca_pillars.models.pillar.network import PillarDetector, PillarOutputs, build_pillar_detector
-from asca_pillars.models.pillar.preparation import (
-    LabeledPillars,
-    PillarBatch,
-    Placement,
-    batch_pillars,
-    batch_targets,
-)
-from asca_pillars.models.scan_detector import ScanDetector
+from asca_pillars.models.pillar.preparation import LabeledPillars, PillarBatch, Placement, batch_pillars
 from asca_pillars.ops.pillar.neck_rulebooks import MaskRule, NeckRulebookBuilder
 from tests.helpers.scenes import SPEC, make_scene
+from tests.models.pillar.loss_scenes import batched, scene_targets
 
 NETWORK = NetworkConfig(pillar_channels=8, block_channels=(8, 12, 16), block_convs=(2, 1, 1), upsample_channels=8)
 RULES = ("sub", "fine")
@@ -71,15 +64,6 @@ def test_tables_and_masks_are_the_same_function(rule: MaskRule, training: bool) 
             torch.testing.assert_close(one, other, rtol=1e-6, atol=1e-8, msg=partial(operator.add, name))
 
 
-@pytest.mark.parametrize("rule", RULES)
-def test_single_precision_agrees_to_a_hundred_thousandth(rule: MaskRule) -> None:
-    detector, batch = make_detector(rule).eval(), make_batch(rule)
-    with torch.inference_mode():
-        expected = detector.head.at_cells(dense_rows(detector, batch))
-        for found, want in zip(detector(batch), expected, strict=True):
-            torch.testing.assert_close(found, want, rtol=0, atol=1e-5)
-
-
 def test_where_everything_is_active_it_is_the_dense_neck() -> None:
     # One pillar in every cell; statistics over active cells are then those over the map.
     dense, sparse = make_detector(None).train().double(), make_detector("fine").train().double()
@@ -111,21 +95,9 @@ def test_frames_of_a_batch_do_not_touch() -> None:
 
 @pytest.mark.parametrize("score_target", ["one", "iou"])
 def test_the_loss_is_that_of_the_active_anchors(score_target: Literal["one", "iou"]) -> None:
-    frames = [make_scene(seed) for seed in (0, 1)]
     batch, detector = make_batch("fine"), make_detector("fine").eval()
     detector.loss_weights = LossConfig(score_target=score_target)
-    targets = [
-        assign_targets(SPEC.anchors, SPEC.classes, boxes, np.array([SPEC.class_names.index(name) for name in names]))
-        for _, boxes, names in frames
-    ]
-    size = targets[0].state.size
-    whole = TargetBatch(
-        torch.from_numpy(np.stack([each.state for each in targets])),
-        torch.from_numpy(np.concatenate([each.positives + i * size for i, each in enumerate(targets)])),
-        torch.from_numpy(np.concatenate([each.anchors for each in targets])),
-        torch.from_numpy(np.concatenate([each.residuals for each in targets])),
-        torch.from_numpy(np.concatenate([each.directions for each in targets])),
-    )
+    whole = batched([scene_targets(seed)[2] for seed in (0, 1)])
     assert batch.neck is not None
     cells = batch.neck.head_cells.long()
     with torch.inference_mode():
@@ -146,29 +118,6 @@ def test_the_loss_is_that_of_the_active_anchors(score_target: Literal["one", "io
     as_maps = type(rows)(*(part.view(2, height, width, -1).permute(0, 3, 1, 2) for part in maps))
     for one, other in zip(found, detection_loss(as_maps, masked, detector.loss_weights), strict=True):
         torch.testing.assert_close(one, other)
-
-
-def test_targets_at_cells_are_those_of_their_anchors() -> None:
-    anchors, per_cell = SPEC.anchors.reshape(-1, 7), SPEC.anchors.shape[2]
-    _, boxes, names = make_scene(0)
-    labels = np.array([SPEC.class_names.index(name) for name in names])
-    targets = assign_targets(SPEC.anchors, SPEC.classes, boxes, labels)
-    cells = np.unique(targets.positives // per_cell)[1::2]
-    found = targets_at(batch_targets([targets]), torch.from_numpy(cells))
-    row, anchor = np.divmod(found.positives.numpy(), per_cell)
-    np.testing.assert_array_equal(found.anchors, anchors[cells[row] * per_cell + anchor])
-    own = np.isin(targets.positives // per_cell, cells)
-    assert 0 < own.sum() < len(own)
-    np.testing.assert_array_equal(found.residuals, targets.residuals[own])
-    np.testing.assert_array_equal(found.directions, targets.directions[own])
-    np.testing.assert_array_equal(found.state, targets.state.reshape(-1, per_cell)[cells])
-
-
-def test_it_detects_and_an_empty_scan_finds_nothing() -> None:
-    detector = make_detector("fine").eval()
-    spec = SPEC.with_score_threshold(0.0)
-    assert len(ScanDetector(detector, spec)(make_scene(0)[0])) > 0
-    assert len(ScanDetector(detector, spec)(np.empty((0, 4), np.float32))) == 0
 
 
 def test_a_rule_that_cannot_grow_is_refused() -> None:

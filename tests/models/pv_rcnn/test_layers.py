@@ -1,4 +1,4 @@
-"""The network and both stages' training: published sizes, gradients, batches, and one frame learnt by heart."""
+"""The network and the training of both stages: sizes, gradients, batches, a frame learnt by heart; dual attention."""
 
 import dataclasses
 from typing import Any
@@ -6,20 +6,16 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from torch.nn import functional as F  # noqa: N812  (torch's own convention)
 
-from asca_pillars.base.errors import ConfigError
-from asca_pillars.config.pv_rcnn import PvRcnnModel, PvRcnnNetwork
+from asca_pillars.config.pv_rcnn import PvRcnnModel
 from asca_pillars.config.tree import load_config
 from asca_pillars.data.frames import LabeledFrame
 from asca_pillars.detection.proposals import AnchorProposals
 from asca_pillars.geometry.overlap import iou_3d
-from asca_pillars.models.pv_rcnn.layers import build_pv_rcnn
+from asca_pillars.models.pv_rcnn.layers import DualAttention, build_pv_rcnn
 from asca_pillars.models.pv_rcnn.network import PvRcnnDetector
 from asca_pillars.models.pv_rcnn.preparation import LabeledVoxels
-from asca_pillars.ops.pv_rcnn.prepare import VoxelSetSettings
 from tests.models.pv_rcnn.tiny_pv_rcnn import MODEL, SPEC, VARIANTS, batch, frame, tiny_detector
-from tests.ops.sparse.dense_volumes import at_cells, dense
 
 EVERY_ANCHOR = AnchorProposals(candidates=3000, nms_iou=0.95, count=3000)
 
@@ -69,55 +65,25 @@ def test_the_published_model_has_its_published_size() -> None:
     assert sum(counts.values()) == 13_115_697
 
 
-def test_voxels_are_convolved_as_densely() -> None:
+@pytest.mark.parametrize("order", [(0, 1, None), (None, 1, 0)])
+def test_a_batch_is_its_frames_of_which_one_may_be_empty(order: tuple[int | None, ...]) -> None:
     detector = seeing_detector()
-    scans = batch(detector, frame(0)).scans
-    features, levels = scans.features.double(), scans.levels
-    backbone = detector.network.voxels.double()
-    with torch.inference_mode():
-        found = backbone(features, levels)
-        for number, (shape, level) in enumerate(zip(SPEC.level_shapes, levels, strict=True)):
-            layers = list(backbone.same[number].children()) if number < len(backbone.same) else []
-            before = SPEC.level_shapes[max(number - 1, 0)], levels[max(number - 1, 0)].cells.numpy()
-            convolutions: list[Any] = [(layer, 1, 1, (shape, level.cells.numpy())) for layer in layers]
-            if number:
-                strided = SPEC.strided[number - 1]
-                convolutions.insert(0, (backbone.down[number - 1], strided.stride, strided.padding, before))
-            for layer, stride, padding, (lattice, cells) in convolutions:
-                volume = dense(features.numpy(), cells, lattice)
-                volume = F.conv3d(volume, layer.convolution.weight, stride=stride, padding=padding)
-                features = torch.relu(layer.norm(torch.from_numpy(at_cells(volume, level.cells.numpy()))))
-            torch.testing.assert_close(found[number], features)
-
-
-def test_shapes_and_the_canvas() -> None:
-    detector = tiny_detector().eval()
-    inputs = batch(detector, frame(0), frame(1))
-    with torch.inference_mode():
-        first = detector.network.propose(inputs.scans)
-        outputs = detector.predict(inputs)
-    rows, columns = SPEC.map_shape
-    assert [part.shape for part in first.maps] == [(2, channels * 6, rows, columns) for channels in (3, 7, 2)]
-    assert first.canvas.shape == (2, rows, columns, 2 * 12)
-    cells, height = inputs.scans.levels[-1].cells, 2
-    row, z = divmod(int(cells[-1]), height)
-    torch.testing.assert_close(first.canvas.flatten(0, 2)[row].view(height, 12)[z], first.levels[-1][-1])
-    rois = sum(map(len, outputs.proposals))
-    assert rois == len(outputs.found.confidence) == len(outputs.found.residuals) == 2 * 24
-    assert len(outputs.found.keypoint_logits) == len(inputs.scans.keypoints) == len(inputs.keypoint_states)
-
-
-def test_a_batch_of_two_is_two_batches_of_one() -> None:
-    detector = seeing_detector()
-    frames = frame(0), frame(1)
+    empty = LabeledFrame("", np.empty((0, 4), np.float32), np.empty((0, 7), np.float32), np.empty(0, np.int64))
+    frames = [empty if seed is None else frame(seed) for seed in order]
     with torch.inference_mode():
         together = detector.predict(batch(detector, *frames))
         alone = [detector.predict(batch(detector, each)) for each in frames]
     for number, one in enumerate(alone):
-        torch.testing.assert_close(together.maps.scores[number], one.maps.scores[0], atol=1e-5, rtol=1e-4)
-        np.testing.assert_allclose(together.proposals[number].boxes, one.proposals[0].boxes, atol=1e-4)
+        for joined, own in zip(together.maps, one.maps, strict=True):
+            torch.testing.assert_close(joined[number], own[0], atol=1e-5, rtol=1e-4)
+        found, expected = together.proposals[number], one.proposals[0]
+        assert len(found) == len(expected) and (len(found) > 0) == (order[number] is not None)
+        np.testing.assert_allclose(found.boxes, expected.boxes, atol=1e-4)
+        np.testing.assert_allclose(found.scores, expected.scores, atol=1e-5)
+        np.testing.assert_array_equal(found.labels, expected.labels)
     confidence = torch.cat([one.found.confidence for one in alone])
     torch.testing.assert_close(together.found.confidence, confidence, atol=1e-4, rtol=1e-3)
+    assert gradients(detector, batch(detector, *frames))
 
 
 @pytest.mark.parametrize("changes", VARIANTS.values(), ids=VARIANTS)
@@ -176,25 +142,6 @@ def test_a_batch_without_voxels_is_learnt_from_and_changes_nothing(points: int) 
     assert (len(found[0]) == 0) == (points == 0)
 
 
-def test_an_empty_frame_changes_nothing_of_a_full_one_beside_it() -> None:
-    detector = seeing_detector()
-    empty = LabeledFrame("", np.empty((0, 4), np.float32), np.empty((0, 7), np.float32), np.empty(0, np.int64))
-    with torch.inference_mode():
-        alone = detector.predict(batch(detector, frame(0)))
-        for number, order in enumerate(((frame(0), empty), (empty, frame(0)))):
-            together = detector.predict(batch(detector, *order))
-            for joined, own in zip(together.maps, alone.maps, strict=True):
-                torch.testing.assert_close(joined[number], own[0], atol=1e-5, rtol=1e-4)
-            found, expected = together.proposals[number], alone.proposals[0]
-            assert len(found) == len(expected) > 0
-            np.testing.assert_allclose(found.boxes, expected.boxes, atol=1e-4)
-            np.testing.assert_allclose(found.scores, expected.scores, atol=1e-5)
-            np.testing.assert_array_equal(found.labels, expected.labels)
-            torch.testing.assert_close(together.found.confidence, alone.found.confidence, atol=1e-4, rtol=1e-3)
-    for order in ((frame(0), empty), (empty, frame(0))):
-        assert gradients(detector, batch(detector, *order))
-
-
 def test_lower_precision_leaves_positions_alone() -> None:
     detector = tiny_detector().eval()
     inputs = batch(detector, frame(0))
@@ -240,15 +187,40 @@ def _mistakes(detector: PvRcnnDetector, inputs: LabeledVoxels, expected: Labeled
     return "" if np.array_equal(found.labels[best], expected.labels) else f"labels {found.labels[best]}"
 
 
-def test_settings_that_cannot_be() -> None:
-    for make, message in (
-        (lambda: PvRcnnModel(rois=1), "model.rois = 1"),
-        (lambda: PvRcnnModel(network=PvRcnnNetwork(source_widths=((8,),))), "source_widths has 1 entries"),
-        (lambda: PvRcnnNetwork(dropout=1.0), "model.network.dropout = 1"),
-        (lambda: PvRcnnNetwork(grid_widths=()), "model.network.grid_widths"),
-        (lambda: PvRcnnNetwork(block_convs=(-1, 1)), "model.network.block_convs"),
-        (lambda: VoxelSetSettings(keypoints=0), "keypoints 0"),
-        (lambda: VoxelSetSettings(grid_radii_m=()), "grid_radii_m"),
-    ):
-        with pytest.raises(ConfigError, match=message):
-            make()
+def by_hand(module: DualAttention, features: np.ndarray) -> np.ndarray:
+    """Eq. (1)-(4) on one map (C, H, W), with loops over places."""
+
+    def at(layer: torch.nn.Conv2d, value: np.ndarray) -> np.ndarray:
+        bias = 0.0 if layer.bias is None else layer.bias.detach().numpy()
+        return np.asarray(layer.weight[:, :, 0, 0].detach().numpy() @ value + bias)
+
+    places = [tuple(place) for place in np.ndindex(*features.shape[1:])]
+    scores = np.array([at(module.channel_query, features[:, y, x])[0] for y, x in places])
+    shares = np.exp(scores - scores.max()) / np.exp(scores - scores.max()).sum()
+    pooled = sum(
+        share * at(module.channel_value, features[:, y, x]) for share, (y, x) in zip(shares, places, strict=True)
+    )
+    out, norm = module.channel_out, module.channel_norm
+    wide = out.weight.detach().numpy() @ pooled + out.bias.detach().numpy()
+    normed = (wide - wide.mean()) / np.sqrt(wide.var() + norm.eps)
+    weights = 1 / (1 + np.exp(-(normed * norm.weight.detach().numpy() + norm.bias.detach().numpy())))
+    attended = features * weights[:, None, None]
+    query = np.mean([at(module.place_query, attended[:, y, x]) for y, x in places], axis=0)
+    shares = np.exp(query - query.max()) / np.exp(query - query.max()).sum()
+    result = np.empty_like(attended)
+    for y, x in places:
+        weight = 1 / (1 + np.exp(-(shares @ at(module.place_value, attended[:, y, x]))))
+        result[:, y, x] = weight * attended[:, y, x]
+    return result
+
+
+@pytest.mark.parametrize("residual", [True, False])
+def test_dual_attention_is_what_the_equations_say(residual: bool) -> None:
+    torch.manual_seed(0)
+    module = DualAttention(6, residual=residual).double()
+    features = torch.randn(2, 6, 3, 4, dtype=torch.float64)
+    with torch.inference_mode():
+        found = module(features).numpy()
+    for one, expected in zip(found, features.numpy(), strict=True):
+        attended = by_hand(module, expected)
+        np.testing.assert_allclose(one, expected + 0.1 * attended if residual else attended, atol=1e-9)

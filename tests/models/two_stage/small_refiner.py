@@ -1,4 +1,4 @@
-"""A small second stage and its input."""
+"""A small second stage, and its input as training draws it."""
 
 import numpy as np
 import torch
@@ -6,13 +6,13 @@ import torch
 from asca_pillars.data.frames import LabeledFrame
 from asca_pillars.detection.detections import Detections
 from asca_pillars.models.two_stage.layers import BallSource, KeypointEncoder, PillarRefiner, RoiHead
-from asca_pillars.models.two_stage.preparation import RefineBatch, collate_samples
+from asca_pillars.models.two_stage.preparation import RefineBatch, RefineSample, collate_samples, sample_of
 from asca_pillars.models.two_stage.sets import SetAbstraction
 from asca_pillars.ops.points.sampling import farthest_points
 from asca_pillars.ops.two_stage.first_stage import SecondStageInputs
 from asca_pillars.ops.two_stage.prepare import RefineSettings
+from asca_pillars.ops.two_stage.rois import match_proposals, sample_rois
 from tests.helpers.scenes import make_scene
-from tests.models.two_stage.drawn_samples import prepare_sample
 
 NAMES = ("Car", "Pedestrian", "Cyclist")
 LABELS = np.array([0, 0, 1, 2])
@@ -41,6 +41,14 @@ def proposed_frame(seed: int) -> tuple[LabeledFrame, SecondStageInputs]:
     keypoints = np.ascontiguousarray(points[farthest_points(points, 256), :3])
     bev = rng.normal(size=(len(keypoints), BEV_CHANNELS)).astype(np.float32)
     return LabeledFrame(f"{seed:06d}", points, boxes, LABELS), SecondStageInputs(detections, keypoints, bev)
+
+
+def prepare_sample(
+    frame: LabeledFrame, proposed: SecondStageInputs, settings: RefineSettings, rois: int, rng: np.random.Generator
+) -> RefineSample:
+    """Draw `rois` proposals of a frame and compute their neighbours and targets."""
+    overlaps = match_proposals(proposed.proposals, frame.boxes, frame.labels)
+    return sample_of(frame, proposed, overlaps, sample_rois(overlaps, rois, rng), settings)
 
 
 def batch(seeds: tuple[int, ...]) -> RefineBatch:

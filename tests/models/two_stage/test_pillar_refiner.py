@@ -7,32 +7,20 @@ import torch
 from asca_pillars.detection.decode import PostProcess
 from asca_pillars.detection.detections import Detections
 from asca_pillars.geometry.overlap import iou_3d
-from asca_pillars.models.two_stage.layers import BallSource, KeypointEncoder, PillarRefiner, RoiHead
 from asca_pillars.models.two_stage.loss import refine_loss
 from asca_pillars.models.two_stage.network import refine
 from asca_pillars.models.two_stage.preparation import collate_samples, collate_scans
-from asca_pillars.models.two_stage.sets import SetAbstraction
 from asca_pillars.ops.two_stage.first_stage import SecondStageInputs
-from asca_pillars.ops.two_stage.prepare import RefineSettings, refine_scan
-from tests.models.two_stage.drawn_samples import prepare_sample
+from asca_pillars.ops.two_stage.prepare import refine_scan
 from tests.models.two_stage.small_refiner import (
-    BEV_CHANNELS,
     LABELS,
     NAMES,
     SETTINGS,
     batch,
+    prepare_sample,
     proposed_frame,
     small_refiner,
 )
-
-
-def test_shapes() -> None:
-    inputs, targets = batch((0, 1))
-    found = small_refiner()(inputs)
-    assert found.confidence.shape == targets.confidence.shape == (32,)
-    assert found.residuals.shape == targets.residuals.shape == (32, 7)
-    assert found.keypoint_logits.shape == targets.keypoint_states.shape
-    assert targets.positive.any() and (targets.keypoint_states == 1).any()
 
 
 def test_an_untrained_head_hardly_moves_proposals() -> None:
@@ -57,31 +45,8 @@ def test_every_weight_learns() -> None:
     assert not still
 
 
-def test_gradients() -> None:
-    torch.manual_seed(0)
-    encode = KeypointEncoder([BallSource(1, 1, (3,))], BEV_CHANNELS, 4, weighting_channels=4)
-    head = RoiHead([SetAbstraction(4, (3,))], 2, roi_channels=7, hidden=4, dropout=0.0)
-    network = PillarRefiner(encode, head).double().eval()
-    settings = RefineSettings(ball_radii_m=(0.8,), ball_samples=3, grid_size=2, grid_radii_m=(1.6,), grid_samples=3)
-    frame, proposed = proposed_frame(0)
-    few = SecondStageInputs(proposed.proposals, proposed.keypoints[:12], proposed.bev[:12])
-    inputs = collate_scans([refine_scan(frame.points, few, few.proposals[:2], settings)])
-    inputs = inputs._replace(
-        **{
-            name: getattr(inputs, name).double()
-            for name in ("points", "keypoints", "bev", "grid_points", "roi_features")
-        }
-    )
-
-    def found(bev: torch.Tensor, roi_features: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        return tuple(network(inputs._replace(bev=bev, roi_features=roi_features)))
-
-    assert torch.autograd.gradcheck(found, (inputs.bev.requires_grad_(), inputs.roi_features.requires_grad_()))
-
-
 def test_learns_one_frame_by_heart() -> None:
-    network, frame_and_proposals = small_refiner(), proposed_frame(5)
-    frame, proposed = frame_and_proposals
+    network, (frame, proposed) = small_refiner(), proposed_frame(5)
     rng = np.random.default_rng(0)
     optimizer = torch.optim.Adam(network.parameters(), lr=5e-3)
     for _ in range(150):

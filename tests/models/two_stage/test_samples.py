@@ -7,12 +7,12 @@ import pytest
 
 from asca_pillars.base.errors import ConfigError
 from asca_pillars.data.frames import LabeledFrame
-from asca_pillars.models.two_stage.preparation import RefineSample, collate_samples, collate_scans
+from asca_pillars.models.two_stage.preparation import RefineSample, collate_samples
 from asca_pillars.ops.two_stage.first_stage import run_first_stage
-from asca_pillars.ops.two_stage.prepare import RefineScan, RefineSettings, refine_scan, roi_features
+from asca_pillars.ops.two_stage.prepare import RefineSettings, refine_scan, roi_features
 from tests.helpers.scenes import make_scene
-from tests.models.two_stage.drawn_samples import prepare_sample
 from tests.models.two_stage.random_stage import SETTINGS, RandomStage
+from tests.models.two_stage.small_refiner import prepare_sample
 
 GEOMETRY = RefineSettings(ball_samples=6, grid_size=2, grid_samples=5)
 
@@ -22,10 +22,6 @@ def sample(seed: int, draw: int = 0) -> RefineSample:
     frame = LabeledFrame(f"{seed:06d}", points, boxes, np.array([0, 0, 1, 2]))
     proposed = run_first_stage(RandomStage(), points, SETTINGS)
     return prepare_sample(frame, proposed, GEOMETRY, 12, np.random.default_rng(draw))
-
-
-def scan(seed: int) -> RefineScan:
-    return sample(seed).scan
 
 
 def test_a_sample_depends_on_its_generator_alone() -> None:
@@ -57,8 +53,9 @@ def test_a_second_thread_finds_the_same_neighbors() -> None:
 
 
 def test_indices_of_a_batch_point_at_the_same_rows() -> None:
-    scans = [scan(0), scan(1)]
-    batch = collate_scans(scans)
+    samples = [sample(0), sample(1)]
+    scans, (batch, targets) = [each.scan for each in samples], collate_samples(samples)
+    assert targets.residuals.shape == (24, 7) and len(targets.keypoint_states) == len(batch.keypoints)
     rows = np.concatenate([s.points for s in scans] + [np.full((1, 4), np.nan)])
     for radius, together in enumerate(batch.ball_indices):
         alone = [np.concatenate([s.points, np.full((1, 4), np.nan)])[s.ball_indices[radius]] for s in scans]
@@ -68,14 +65,6 @@ def test_indices_of_a_batch_point_at_the_same_rows() -> None:
         alone = [np.concatenate([s.keypoints, np.full((1, 3), np.nan)])[s.grid_indices[radius]] for s in scans]
         np.testing.assert_array_equal(rows[together.numpy()], np.concatenate(alone))
         assert any((s.grid_indices[radius] == len(s.keypoints)).any() for s in scans), "some balls are empty"
-
-
-def test_shapes_of_a_batch() -> None:
-    inputs, targets = collate_samples([sample(0), sample(1)])
-    assert inputs.roi_features.shape == (24, 3 + 4)
-    assert inputs.grid_points.shape == (24 * 8, 3)
-    assert targets.residuals.shape == (24, 7)
-    assert len(targets.keypoint_states) == len(inputs.keypoints)
 
 
 def test_roi_features() -> None:

@@ -1,27 +1,17 @@
 """PillarGrid against the paper's equations, and `cells` against a search of the borders."""
 
-import copy
-import dataclasses
 import re
 
 import numpy as np
 import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
-from pydantic import TypeAdapter, ValidationError
 
 from asca_pillars.base.errors import ConfigError
 from asca_pillars.ops.pillar.grid import HEAD_STRIDE, NECK_STRIDE, PillarGrid
 
 # x: 3 zones x 8 columns x 0.32 m = 7.68 m, twice; y: 8 rows x 0.16 m = 1.28 m, eight times.
 SMALL = PillarGrid(x_range_m=(2.0, 17.36), y_range_m=(-3.2, 7.04), z_range_m=(-2.5, 1.5))
-GRIDS = [
-    PillarGrid(),
-    SMALL,
-    PillarGrid(zones=1, v_max_m=0.16),
-    PillarGrid(x_range_m=(-10.24, 10.24), y_range_m=(1.28, 8.96), zones=2),
-    PillarGrid(x_range_m=(5.0, 69.0), y_range_m=(-8.0, 4.0), zones=5, v_max_m=0.8, v_y_m=0.25),
-]
 
 
 @st.composite
@@ -49,12 +39,6 @@ def test_default_is_the_papers_grid() -> None:
     np.testing.assert_allclose(np.diff(grid.y_edges_m), 0.16)
 
 
-def test_one_zone_is_pointpillars() -> None:
-    grid = PillarGrid(zones=1, v_max_m=0.16)
-    assert (grid.nx, grid.ny) == (432, 496)
-    np.testing.assert_allclose(np.diff(grid.x_edges_m), 0.16)
-
-
 @given(grids())
 def test_depths_follow_equations_1_to_5(grid: PillarGrid) -> None:
     d_min, d_max = grid.x_range_m
@@ -66,10 +50,7 @@ def test_depths_follow_equations_1_to_5(grid: PillarGrid) -> None:
 
 @given(grids())
 def test_ranges_are_filled_exactly(grid: PillarGrid) -> None:
-    for edges, span, count in (
-        (grid.x_edges_m, grid.x_range_m, grid.nx),
-        (grid.y_edges_m, grid.y_range_m, grid.ny),
-    ):
+    for edges, span, count in ((grid.x_edges_m, grid.x_range_m, grid.nx), (grid.y_edges_m, grid.y_range_m, grid.ny)):
         assert edges.shape == (count + 1,) and edges.dtype == np.float64
         assert (edges[0], edges[-1]) == span
         assert (np.diff(edges) > 0).all()
@@ -127,39 +108,6 @@ def test_cells_equal_a_search_of_the_borders(grid: PillarGrid, seed: int) -> Non
     assert cells.tolist() == cells_by_search(grid, points)
 
 
-@pytest.mark.parametrize("grid", GRIDS)
-def test_lower_ends_are_inside_and_upper_ends_outside(grid: PillarGrid) -> None:
-    spans = np.array([grid.x_range_m, grid.y_range_m, grid.z_range_m])
-    lowest = spans[:, 0].astype(np.float32)
-    assert grid.cells(lowest[None]).tolist() == [0]
-    highest_inside = np.nextafter(spans[:, 1].astype(np.float32), np.float32(-np.inf))
-    assert grid.cells(highest_inside[None]).tolist() == [grid.nx * grid.ny - 1]
-    for axis in range(3):
-        outside = lowest.copy()
-        outside[axis] = spans[axis, 1]
-        assert grid.cells(outside[None]).tolist() == [-1]
-        outside[axis] = np.nextafter(lowest[axis], np.float32(-np.inf))
-        assert grid.cells(outside[None]).tolist() == [-1]
-
-
-def test_rows_run_along_y_and_columns_along_x() -> None:
-    # 2 m + one pillar of 0.32 m and a bit: column 1; -3.2 m + two pillars of 0.16 m and a bit: row 2.
-    point = np.array([[2.33, -2.87, 0.0, 0.5]], np.float32)
-    assert SMALL.cells(point).tolist() == [2 * SMALL.nx + 1]
-
-
-def test_cells_of_nothing() -> None:
-    cells = SMALL.cells(np.empty((0, 4), np.float32))
-    assert cells.shape == (0,) and cells.dtype == np.int64
-    assert SMALL.cell_centers_m(cells).shape == (0, 2)
-
-
-@pytest.mark.parametrize("shape", [(5,), (5, 2), (1, 5, 4)])
-def test_cells_refuses_other_shapes(shape: tuple[int, ...]) -> None:
-    with pytest.raises(ValueError, match=re.escape(str(shape))):
-        SMALL.cells(np.zeros(shape, np.float32))
-
-
 @pytest.mark.parametrize(
     ("settings", "named"),
     [
@@ -189,12 +137,7 @@ def test_illegal_grids_are_refused_with_advice(settings: dict[str, object], name
         assert text in message
 
 
-@given(
-    st.sampled_from([0.0, -20.0, 3.5]) | st.none(),
-    st.floats(1, 120),
-    st.floats(0.05, 0.6),
-    st.integers(1, 5),
-)
+@given(st.sampled_from([0.0, -20.0, 3.5]) | st.none(), st.floats(1, 120), st.floats(0.05, 0.6), st.integers(1, 5))
 def test_advice_on_x_works(start_m: float | None, length_m: float, v_max_m: float, zones: int) -> None:
     span = (-length_m / 2, length_m / 2) if start_m is None else (start_m, start_m + length_m)
     try:
@@ -227,22 +170,3 @@ def test_advice_on_y_works(start_m: float, length_m: float, v_y_m: float) -> Non
         PillarGrid(y_range_m=(float(a), float(b)), v_y_m=v_y_m)
     (size,) = re.findall(r"v_y_m (\S+)$", advice)
     PillarGrid(y_range_m=span, v_y_m=float(size))
-
-
-def test_a_grid_is_a_value() -> None:
-    same = dataclasses.replace(SMALL)
-    assert same == SMALL and hash(same) == hash(SMALL)
-    np.testing.assert_array_equal(copy.deepcopy(SMALL).x_edges_m, SMALL.x_edges_m)
-    with pytest.raises(dataclasses.FrozenInstanceError):
-        SMALL.zones = 2  # type: ignore[misc]
-    with pytest.raises(ValueError, match="read-only"):
-        SMALL.x_edges_m[0] = 1.0
-
-
-def test_a_config_with_a_typo_is_refused() -> None:
-    loader = TypeAdapter(PillarGrid)
-    assert loader.validate_python({"zones": 1, "v_max_m": 0.16}).nx == 432
-    with pytest.raises(ValidationError, match="zonez"):
-        loader.validate_python({"zonez": 1})
-    with pytest.raises(ConfigError, match="use x_range_m"):
-        loader.validate_python({"x_range_m": (0, 70)})

@@ -1,7 +1,5 @@
 """`pillarize` against a dictionary of lists, its limits, and clouds that hold almost nothing."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -49,40 +47,22 @@ def assert_consistent(pillars: Pillars, points: np.ndarray, grid: PillarGrid) ->
         np.testing.assert_allclose(inside[:, 7:], inside[:, :2] - grid.cell_centers_m(cell[None]), atol=1e-5)
 
 
-@given(st.integers(0, 2**32 - 1), st.integers(0, 300), st.sampled_from([0.2, 2.0, 12.0]))
-def test_equals_a_dictionary_of_lists(seed: int, count: int, spread_m: float) -> None:
+@given(
+    st.integers(0, 2**32 - 1),
+    st.integers(0, 300),
+    st.sampled_from([0.2, 2.0, 12.0]),
+    st.sampled_from([GRID, PillarGrid()]),  # some 4,000 cells, and 250,000
+)
+def test_equals_a_dictionary_of_lists(seed: int, count: int, spread_m: float, grid: PillarGrid) -> None:
     points = cloud(seed, count, spread_m)
-    pillars = pillarize(points, GRID, NO_LIMITS)
-    expected = pillars_by_loop(points, GRID)
+    pillars = pillarize(points, grid, NO_LIMITS)
+    expected = pillars_by_loop(points, grid)
     assert pillars.cells.tolist() == list(expected)
     assert pillars.point_counts.tolist() == [len(indices) for indices in expected.values()]
     order = [index for indices in expected.values() for index in indices]  # the scan's order within a pillar
     np.testing.assert_array_equal(pillars.features[:, :4], points[order].reshape(-1, 4))
     assert pillars.stats == PillarCounts(count, count - len(order), 0, len(expected), 0)
-    assert_consistent(pillars, points, GRID)
-
-
-def test_features_by_hand() -> None:
-    # x from 2 m in steps of 0.32 m, y from -3.2 m in steps of 0.16 m: both points are in column 1, row 2,
-    # whose center is (2.48, -2.8); their mean is (2.5, -2.79, -1).
-    points = np.array([[2.4, -2.84, -1.5, 0.25], [2.6, -2.74, -0.5, 0.75]], np.float32)
-    pillars = pillarize(points, GRID, PillarLimits())
-    expected = [
-        [2.4, -2.84, -1.5, 0.25, -0.1, -0.05, -0.5, -0.08, -0.04],
-        [2.6, -2.74, -0.5, 0.75, 0.1, 0.05, 0.5, 0.12, 0.06],
-    ]
-    np.testing.assert_allclose(pillars.features, expected, atol=1e-6)
-    assert pillars.cells.tolist() == [2 * GRID.nx + 1]
-    assert pillars.point_counts.tolist() == [2]
-
-
-def test_large_grids_sort_beyond_16_bits() -> None:
-    grid = PillarGrid()
-    assert grid.nx * grid.ny > 1 << 16
-    points = cloud(1, 5000, 30.0)
-    pillars = pillarize(points, grid, NO_LIMITS)
-    assert pillars.cells.tolist() == list(pillars_by_loop(points, grid))
-    assert pillars.cells.max() > 1 << 16
+    assert_consistent(pillars, points, grid)
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(1, 30), st.integers(1, 8))
@@ -102,16 +82,9 @@ def test_limits_keep_a_subset(seed: int, max_pillars: int, max_points: int) -> N
         assert len(indices) == min(len(expected[cell]), max_points)
         assert set(indices) <= set(expected[cell])
         assert indices == sorted(indices)
-
-
-def test_a_scan_always_gives_the_same_pillars() -> None:
-    points = cloud(2, 3000, 1.0)
-    limits = PillarLimits(max_pillars=50, max_points=3)
-    first, second = (pillarize(points.copy(), GRID, limits) for _ in range(2))
-    assert first.stats.pillars_over_limit > 0 and (first.point_counts == 3).any()
-    for field in dataclasses.fields(Pillars)[:-1]:
-        assert getattr(first, field.name).tobytes() == getattr(second, field.name).tobytes()
-    assert first.stats == second.stats
+    before = points.copy()
+    pillars.features[:] = 0
+    np.testing.assert_array_equal(points, before)
 
 
 def test_every_part_of_a_crowd_keeps_its_share() -> None:
@@ -132,45 +105,14 @@ def test_an_even_subset_has_steps_that_differ_by_one(count: int, most: int) -> N
     assert steps.max() - steps.min() <= 1
 
 
-def test_points_are_not_changed_nor_shared() -> None:
-    points = cloud(5, 1000, 1.0)
-    before = points.copy()
-    pillars = pillarize(points, GRID, PillarLimits(10, 2))
-    pillars.features[:] = 0
-    np.testing.assert_array_equal(points, before)
-
-
-def test_memory_layout_does_not_matter() -> None:
-    points, limits = cloud(6, 1000, 1.0), PillarLimits(30, 2)
-    expected = pillarize(points, GRID, limits).features
-    wide = np.zeros((1000, 6), np.float32)
-    wide[:, :4] = points
-    np.testing.assert_array_equal(pillarize(wide[:, :4], GRID, limits).features, expected)
-    np.testing.assert_array_equal(pillarize(np.asfortranarray(points), GRID, limits).features, expected)
-
-
 @pytest.mark.parametrize(
-    "points",
-    [
-        np.empty((0, 4)),
-        np.full((3, 4), 1000.0),
-        np.full((3, 4), np.nan),
-    ],
-    ids=["empty", "outside", "nan"],
+    "points", [np.empty((0, 4)), np.full((3, 4), 1000.0), np.full((3, 4), np.nan)], ids=["empty", "outside", "nan"]
 )
 def test_nothing_inside_gives_empty_pillars(points: np.ndarray) -> None:
     pillars = pillarize(points.astype(np.float32), GRID, PillarLimits())
     assert pillars.features.shape == (0, 9)
     assert pillars.cells.shape == pillars.point_counts.shape == pillars.pillar_index.shape == (0,)
     assert pillars.stats == PillarCounts(len(points), len(points), 0, 0, 0)
-    assert_consistent(pillars, points, GRID)
-
-
-def test_one_point_one_pillar() -> None:
-    points = np.array([[5.0, 1.0, 0.0, 0.5]], np.float32)
-    pillars = pillarize(points, GRID, PillarLimits(1, 1))
-    assert pillars.stats == PillarCounts(1, 0, 0, 1, 0)
-    np.testing.assert_array_equal(pillars.features[0, 4:7], 0)
     assert_consistent(pillars, points, GRID)
 
 

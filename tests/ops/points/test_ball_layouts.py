@@ -1,7 +1,7 @@
 """Grouped and gathered balls against the rows of `ball_query`."""
 
 import numpy as np
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from asca_pillars.ops.points.ball_layouts import gather_balls, group_balls, group_widths
@@ -17,6 +17,7 @@ def test_widths() -> None:
     assert group_widths(3) == (1, 2, 3)
 
 
+@settings(max_examples=40)
 @given(CLOUDS, CLOUDS, RADII, st.integers(1, 20))
 def test_every_ball_is_in_the_narrowest_group_with_room(
     points: np.ndarray, queries: np.ndarray, radius_m: float, samples: int

@@ -5,9 +5,7 @@ import pytest
 import torch
 from torch.nn import functional as F  # noqa: N812  (torch's own convention)
 
-from asca_pillars.base.errors import ConfigError
 from asca_pillars.ops.pv_rcnn.rulebooks import PV_RCNN_STRIDED, SUBMANIFOLD, VoxelRulebookBuilder
-from asca_pillars.ops.sparse.rulebooks import Convolution
 from tests.ops.sparse.dense_volumes import at_cells, dense, random_cells
 
 SHAPE = (41, 18, 12)
@@ -42,8 +40,3 @@ def test_every_level_is_the_dense_one(share: float) -> None:
                 features = by_table(features, level.same, weight)
                 np.testing.assert_allclose(features, at_cells(volume, level.cells), atol=1e-9)
         assert levels[-1].same.shape == (0, SUBMANIFOLD.taps)
-
-
-def test_lattices_that_are_too_tall_are_refused() -> None:
-    with pytest.raises(ConfigError, match="64 along z"):
-        VoxelRulebookBuilder((65, 8, 8), (Convolution((3, 3, 3), (2, 2, 2), (1, 1, 1)),), (True, True))

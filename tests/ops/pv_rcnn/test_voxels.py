@@ -1,4 +1,4 @@
-"""Voxels against a loop over points, and the compiled loops against NumPy's."""
+"""Voxels against a loop over points."""
 
 import numpy as np
 import pytest
@@ -8,7 +8,6 @@ from hypothesis import strategies as st
 from asca_pillars.base.errors import ConfigError
 from asca_pillars.ops.pv_rcnn.voxels import VoxelGrid, voxelize
 from asca_pillars.ops.sparse.rulebooks import CellMap
-from tests.ops import numpy_kernels
 
 GRID = VoxelGrid((1.0, 4.0), (-2.0, 1.2), (-1.5, 0.5), (0.3, 0.2, 0.1), max_points=3)
 
@@ -25,20 +24,45 @@ def cloud(seed: int, count: int, spread_m: float, odd: float) -> np.ndarray:
     return points
 
 
+def held(points: np.ndarray, grid: VoxelGrid) -> dict[int, list[np.ndarray]]:
+    """The points of each voxel in the scan's order, by the voxel's flat index: point by point, in float32."""
+    nz, ny, nx = grid.shape
+    found: dict[int, list[np.ndarray]] = {}
+    for point in points:
+        place = [
+            # The quotient may round up to the range's end: its last voxel has the point.
+            min(int((value - np.float32(low)) / np.float32(size)), count - 1)
+            for value, (low, high), size, count in zip(
+                point[:3], grid.ranges_m, grid.size_m, (nx, ny, nz - grid.empty_layers), strict=True
+            )
+            if np.float32(low) <= value < np.float32(high)
+        ]
+        if len(place) == 3:
+            x, y, z = place
+            found.setdefault((y * nx + x) * nz + z, []).append(point)
+    return found
+
+
 @settings(max_examples=100, deadline=None)
 @given(
     st.integers(0, 2**32 - 1),
-    st.sampled_from([0, 1, 50, 500]),
+    st.sampled_from([0, 1, 50, 300]),
     st.sampled_from([0.05, 1.0]),
     st.sampled_from([0.0, 0.4]),
 )
-def test_voxels_are_the_same_in_numpy(seed: int, count: int, spread_m: float, odd: float) -> None:
+@example(7, 400, 0.5, 0.0)  # more points in a voxel than enter its mean, and points outside
+def test_voxels_hold_the_mean_of_their_first_points(seed: int, count: int, spread_m: float, odd: float) -> None:
     points, cell_map = cloud(seed, count, spread_m, odd), CellMap(GRID.shape)
     voxelize(cloud(seed + 1, count, spread_m, odd), GRID, cell_map)  # of which nothing may stay
-    found, expected = voxelize(points, GRID, cell_map), numpy_kernels.voxels(points, GRID)
-    for one, other in zip(found, expected, strict=True):
-        np.testing.assert_array_equal(one, other)
-    assert found.features.dtype == expected.features.dtype == np.float32
+    found, expected = voxelize(points, GRID, cell_map), held(points, GRID)
+    assert found.cells.tolist() == sorted(expected)
+    assert found.points_outside == count - sum(map(len, expected.values()))
+    assert found.features.dtype == np.float32 and found.features.shape == (len(expected), 4)
+    for cell, feature in zip(found.cells, found.features, strict=True):
+        first = np.array(expected[cell][: GRID.max_points], np.float64)
+        np.testing.assert_array_equal(feature, (np.cumsum(first, axis=0)[-1] / len(first)).astype(np.float32))
+    inside = np.abs(GRID.centers_m(found.cells) - found.features[:, :3]) <= np.array(GRID.size_m) / 2 + 1e-5
+    assert inside.all()
 
 
 @settings(max_examples=60, deadline=None)
@@ -50,42 +74,9 @@ def test_the_last_point_of_a_range_is_in_its_last_voxel(count: int, size_m: floa
     ends = np.array([low_m, low_m + count * size_m], np.float32)
     points = np.array([[ends[0], 0.15, 0.15], [np.nextafter(ends[1], ends[0]), 0.15, 0.15]], np.float32)
     cells = grid.cells(points)
-    np.testing.assert_array_equal(cells, numpy_kernels.voxel_cells(points, grid))
     assert grid.shape == (2, 2, count)
     columns = (0, count - 1)
     assert cells.tolist() == [(count + column) * 2 + 1 for column in columns], "second row of y, second layer of z"
-
-
-@pytest.mark.parametrize(
-    "form", [lambda p: voxelize(p, GRID, CellMap(GRID.shape)), lambda p: numpy_kernels.voxels(p, GRID)]
-)
-def test_voxels_hold_the_mean_of_their_first_points(form: object) -> None:
-    points = cloud(7, 400, 0.5, 0.0)
-    nz, ny, nx = GRID.shape
-    assert (nz, ny, nx) == (21, 16, 10)  # one layer above the range
-    held: dict[int, list[np.ndarray]] = {}
-    outside = 0
-    for point in points:
-        x, y, z = (
-            int(np.floor((point[axis] - low) / size))
-            for axis, ((low, _), size) in enumerate(zip(GRID.ranges_m, GRID.size_m, strict=True))
-        )
-        if 0 <= x < nx and 0 <= y < ny and 0 <= z < nz - 1:
-            held.setdefault((y * nx + x) * nz + z, []).append(point)
-        else:
-            outside += 1
-    voxels = form(points)  # type: ignore[operator]
-    assert voxels.points_outside == outside > 0
-    assert voxels.cells.tolist() == sorted(held)
-    assert max(map(len, held.values())) > GRID.max_points
-    for cell, feature in zip(voxels.cells, voxels.features, strict=True):
-        np.testing.assert_allclose(feature, np.mean(held[cell][: GRID.max_points], axis=0), rtol=1e-6)
-    inside = np.abs(GRID.centers_m(voxels.cells) - voxels.features[:, :3]) <= np.array(GRID.size_m) / 2 + 1e-5
-    assert inside.all()
-
-
-def test_the_default_grid_is_that_of_pv_rcnn() -> None:
-    assert VoxelGrid().shape == (41, 1600, 1408)
 
 
 @pytest.mark.parametrize(
@@ -101,8 +92,3 @@ def test_the_default_grid_is_that_of_pv_rcnn() -> None:
 def test_impossible_grids_are_refused(change: dict[str, object], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         VoxelGrid(**change)  # type: ignore[arg-type]
-
-
-def test_a_map_of_another_shape_is_refused() -> None:
-    with pytest.raises(ValueError, match="shape"):
-        voxelize(np.zeros((1, 4), np.float32), GRID, CellMap((1, 2, 3)))

@@ -34,15 +34,6 @@ def test_what_comes_to_the_same_place_is_found_once_in_each_class() -> None:
     assert found.labels.tolist() == [0, 1, 0], "three at most"
 
 
-def test_what_is_not_finite_is_left_out() -> None:
-    residuals = np.zeros((3, 7), np.float32)
-    residuals[0, 0] = np.nan
-    proposals = Detections(at(10, 30, 50), np.full(3, 0.5, np.float32), np.zeros(3, np.int64), NAMES)
-    found = refined_detections(proposals, np.array([0.9, np.nan, 0.5], np.float32), residuals, POST)
-    np.testing.assert_allclose(found.boxes, at(50), atol=1e-5)
-    assert found.non_finite == 2
-
-
 def test_what_is_not_finite_in_either_stage_is_counted() -> None:
     spec = PvRcnnModel().spec.with_score_threshold(0.1)
     boxes, labels = at(10, 30, 50), np.zeros(3, np.int64)
@@ -51,7 +42,12 @@ def test_what_is_not_finite_in_either_stage_is_counted() -> None:
     residuals[0, 0] = np.nan
     residuals[1, 0] = 3e38  # a place beyond float32
     found = reported_detections(proposals, np.full(3, 2.0, np.float32), residuals, spec, "second")
-    assert len(found) == 1 and found.non_finite == 7 + 2
+    np.testing.assert_allclose(found.boxes, at(50), atol=1e-5)
+    assert found.non_finite == 7 + 2
+    scores = np.array([2.0, np.nan, np.nan], np.float32)
+    found = reported_detections(proposals, scores, np.zeros((3, 7), np.float32), spec, "second")
+    np.testing.assert_allclose(found.boxes, at(10), atol=1e-5)
+    assert found.non_finite == 7 + 2
 
 
 def test_scores_of_both_stages_are_their_geometric_mean() -> None:

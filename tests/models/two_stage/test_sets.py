@@ -1,13 +1,15 @@
-"""The split first layer against the equation as printed."""
+"""Set abstraction, whose first layer is split, and VectorPool against the equations as printed."""
 
 import copy
 from typing import TypeAlias
 
+import numpy as np
 import pytest
 import torch
 from torch.nn import functional as F  # noqa: N812  (torch's own convention)
 
-from asca_pillars.models.two_stage.sets import SetAbstraction
+from asca_pillars.models.two_stage.sets import SetAbstraction, VectorPool
+from asca_pillars.ops.points.neighbors import nearest_in_cubes
 
 Balls: TypeAlias = tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]
 
@@ -79,16 +81,78 @@ def test_an_empty_ball_is_the_mlp_of_zero_wherever_it_is() -> None:
         torch.testing.assert_close(module(positions, features, moved, indices)[1], zero)
 
 
-def test_gradients() -> None:
-    torch.manual_seed(0)
-    module = SetAbstraction(2, (3, 2)).double().eval()
-    positions, features, queries, indices = balls(torch.float64)
-    inputs = [part.requires_grad_() for part in (positions, features, queries)]
-    assert torch.autograd.gradcheck(lambda p, f, q: module(p, f, q, indices), inputs)
-
-
 def test_no_points_and_no_queries() -> None:
     module = SetAbstraction(1, (4,)).eval()
     nothing = torch.zeros(3, 2, dtype=torch.int32)
     assert module(torch.zeros(0, 3), torch.zeros(0, 1), torch.zeros(3, 3), nothing).shape == (3, 4)
     assert module(torch.zeros(2, 3), torch.zeros(2, 1), torch.zeros(0, 3), nothing[:0]).shape == (0, 4)
+
+
+HALF_M = 0.8
+
+
+def scene(channels: int = 4) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """30 points, their features, 6 queries and the neighbors of their cells; the last two have two points and none."""
+    rng = np.random.default_rng(0)
+    points = np.concatenate([rng.uniform(-1.5, 1.5, (28, 3)), [[50, 0, 0], [50.5, 0.2, 0]]])
+    queries = np.concatenate([rng.uniform(-1, 1, (4, 3)), [[50.1, 0, 0], [90, 0, 0]]])
+    queries[0] = points[0]  # the middle cell's center is a point
+    return points, rng.normal(size=(30, channels)), queries, nearest_in_cubes(points, queries, HALF_M, 3)
+
+
+def pool_by_hand(
+    pool: VectorPool, points: np.ndarray, features: np.ndarray, query: np.ndarray, rows: np.ndarray
+) -> np.ndarray:
+    """Eq. (13) to (15) for one query in evaluation mode, after the printed form: W_t on what is interpolated."""
+    channels, of_cells = pool.places.shape[2], []
+    kernels = pool.features.weight.detach().numpy().reshape(27, channels, -1)
+    for cell, (center, of_cell) in enumerate(zip(pool.centers.double().numpy(), rows, strict=True)):
+        near = [i for i in of_cell if i < len(points)]
+        away = np.zeros((3, 3))
+        away[: len(near)] = points[near] - (query + center)
+        interpolated = np.zeros(features.shape[1])
+        if near:
+            weights = 1 / np.maximum(np.linalg.norm(away[: len(near)], axis=1), 1e-8)
+            interpolated = weights @ features[near] / weights.sum()
+        of_cells.append(away.reshape(-1) @ pool.places[cell].detach().numpy() + kernels[cell] @ interpolated)
+    value = torch.from_numpy(np.concatenate(of_cells))[None]
+    with torch.inference_mode():
+        return pool.mlp(torch.relu(pool.norm(value)))[0].numpy()
+
+
+def random_pool(channels: int = 4) -> VectorPool:
+    torch.manual_seed(0)
+    pool = VectorPool(channels, HALF_M, 3, 5, (8, 7)).double().eval()
+    for name, value in pool.named_buffers():
+        if name.endswith("running_mean"):
+            torch.nn.init.uniform_(value, -0.5, 0.2)
+        elif name.endswith("running_var"):
+            torch.nn.init.uniform_(value, 0.3, 1.0)
+    return pool
+
+
+def test_vector_pool_is_what_the_equations_say() -> None:
+    pool, (points, features, queries, rows) = random_pool(), scene()
+    with torch.inference_mode():
+        found = pool(*(torch.from_numpy(part) for part in (points, features, queries, rows))).numpy()
+    assert found.shape == (6, 7) and (rows[-1] == 30).all() and (rows[-2, :, 2] == 30).all()
+    for query, own, one in zip(queries, rows, found, strict=True):
+        np.testing.assert_allclose(one, pool_by_hand(pool, points, features, query, own), atol=1e-9)
+    assert np.abs(found[0] - found[1]).max() > 1e-3
+
+
+def test_where_a_point_stands_decides_which_weights_it_meets() -> None:
+    pool, features = random_pool(1), torch.ones(1, 1, dtype=torch.float64)
+    queries, found = torch.zeros(1, 3, dtype=torch.float64), []
+    for x in (-0.5, 0.5):
+        points = torch.tensor([[x, 0, 0]], dtype=torch.float64)
+        rows = torch.from_numpy(nearest_in_cubes(points.numpy(), queries.numpy(), HALF_M, 3))
+        found.append(pool(points, features, queries, rows))
+    assert (found[0] - found[1]).abs().max() > 1e-3
+
+
+def test_a_pool_of_no_points_and_no_queries() -> None:
+    pool = random_pool().float()
+    nothing = torch.zeros(3, 27, 3, dtype=torch.int32)
+    assert pool(torch.zeros(0, 3), torch.zeros(0, 4), torch.zeros(3, 3), nothing).shape == (3, 7)
+    assert pool(torch.zeros(2, 3), torch.zeros(2, 4), torch.zeros(0, 3), nothing[:0]).shape == (0, 7)

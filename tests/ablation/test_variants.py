@@ -1,4 +1,4 @@
-"""The rows of the two-stage ablation: each is a network that can be built, and one goes through to the table."""
+"""Rows of both ablations: each goes with the base that ships, and one of two stages goes through to the table."""
 
 import dataclasses
 from pathlib import Path
@@ -8,11 +8,13 @@ import pytest
 import torch
 import yaml
 
-from asca_pillars.ablation.variants import BASE, TWO_STAGE
+from asca_pillars.ablation.variants import BASE, TWO_STAGE, VARIANTS, Variant
 from asca_pillars.base.errors import ConfigError, TrainingError
 from asca_pillars.base.schema import to_dict
+from asca_pillars.base.settings import shipped_configs
 from asca_pillars.cli.ablate import ablate
 from asca_pillars.cli.ablate_steps import check, family_of, parse_variants
+from asca_pillars.config.pillar import PillarModel
 from asca_pillars.config.pv_rcnn import PvRcnnModel
 from asca_pillars.config.tree import load_config
 from asca_pillars.models.build import build_model
@@ -20,6 +22,28 @@ from asca_pillars.models.checkpoint import load_checkpoint
 from asca_pillars.training.loop import train
 from tests.helpers.scenes import write_dataset
 from tests.models.pv_rcnn.tiny_pv_rcnn import MODEL, NETWORK, SETTINGS, tiny_config
+
+
+@pytest.mark.parametrize("variant", VARIANTS.values(), ids=lambda variant: variant.name)
+def test_every_pillar_variant_fits_the_shipped_base(variant: Variant) -> None:
+    config = load_config(shipped_configs()["ablation_small"], variant.overrides)
+    assert isinstance(config.model, PillarModel)
+    assert config.model.spec.grid.zones == variant.zones and config.model.network.cpa == variant.cpa
+    assert config.augment.insert.method == variant.insert
+    grid, along_m = config.model.spec.grid, 0.16 if variant.zones == 1 else 0.32
+    assert (grid.v_max_m, grid.v_y_m) == ((0.08, 0.08) if variant.fine_pillars else (along_m, 0.16))
+    assert config.model.spec.grid.map == variant.map and config.model.network.neck == variant.neck
+    car, *persons = config.model.spec.classes
+    assert (car.positive_iou, car.negative_iou) == (0.6, 0.45)
+    assert {(spec.positive_iou, spec.negative_iou) for spec in persons} == {variant.person_ious or (0.5, 0.35)}
+    assert config.model.loss.assigner == ("atss" if "atss" in variant.name else "overlap")
+    assert config.model.loss.score_target == ("iou" if "iou_score" in variant.name else "one")
+
+
+def test_a_row_that_says_nothing_of_the_loss_keeps_the_base_configuration_s() -> None:
+    config = load_config("ablation_small", ("model.loss.assigner=atss", *VARIANTS["cpa_channel"].overrides))
+    assert isinstance(config.model, PillarModel) and config.model.loss.assigner == "atss"
+
 
 FEW_BALLS = dataclasses.replace(  # each takes its share of the export
     MODEL,

@@ -1,4 +1,6 @@
-"""Which proposals are sampled, and what the second stage should say of them."""
+"""Frames of boxes, residuals of a refinement, which proposals are sampled, and what should be said of them."""
+
+import math
 
 import numpy as np
 import pytest
@@ -7,26 +9,82 @@ from hypothesis import strategies as st
 
 from asca_pillars.detection.anchors import IGNORED
 from asca_pillars.detection.detections import Detections
+from asca_pillars.geometry.boxes import corners, wrap_angle
 from asca_pillars.ops.two_stage.rois import (
     FOREGROUND_IOU,
     HARD_IOU,
     Overlaps,
+    boxes_from_frames,
+    boxes_in_frames,
     decode_refinement,
+    encode_refinement,
+    from_box_frames,
     keypoint_states,
     match_proposals,
+    roi_grid_points,
     roi_targets,
     sample_rois,
+    to_box_frames,
 )
+from tests.ops.points.boxes_near import CHANGES, PROPOSALS, changed
 
-NAMES = ("Car", "Pedestrian")
+Change = tuple[np.ndarray, np.ndarray, float]
 CAR = np.array([10, 0, -1, 4, 2, 1.5, 0], np.float32)
+
+
+@given(PROPOSALS, st.integers(0, 2**32 - 1))
+def test_frames_of_points_round_trip(box: np.ndarray, seed: int) -> None:
+    points = np.random.default_rng(seed).uniform(-50, 50, (1, 20, 3))
+    np.testing.assert_allclose(from_box_frames(to_box_frames(points, box[None]), box[None]), points, atol=1e-9)
+
+
+@given(PROPOSALS, CHANGES)
+def test_frames_of_boxes(frame: np.ndarray, change: Change) -> None:
+    box = changed(frame, change)
+    seen = boxes_in_frames(box[None], frame[None])
+    # The corners of the box as seen are the corners, as seen.
+    np.testing.assert_allclose(corners(seen)[0], to_box_frames(corners(box[None]), frame[None])[0], atol=1e-9)
+    back = boxes_from_frames(seen, frame[None])[0]
+    np.testing.assert_allclose(back[:6], box[:6], atol=1e-9)
+    assert wrap_angle(back[6] - box[6]) == pytest.approx(0, abs=1e-9)
+
+
+@given(PROPOSALS, CHANGES)
+def test_a_refinement_is_decoded_and_half_a_turn_of_the_box_changes_nothing(
+    proposal: np.ndarray, change: Change
+) -> None:
+    box = changed(proposal, change)
+    turned = box + np.array([0, 0, 0, 0, 0, 0, math.pi])
+    for own in (box, turned):
+        residuals = encode_refinement(own[None], proposal[None])
+        assert -math.pi / 2 <= residuals[0, 6] <= math.pi / 2
+        (back,) = decode_refinement(residuals, proposal[None])
+        np.testing.assert_allclose(back[:6], box[:6], rtol=1e-5, atol=2e-5)
+        assert wrap_angle(float(back[6]) - box[6], math.pi) == pytest.approx(0, abs=1e-5)
+        # Refinement does not turn the front to the back.
+        assert abs(wrap_angle(float(back[6]) - proposal[6])) <= math.pi / 2 + 1e-5
+
+
+def test_residuals_by_hand() -> None:
+    # 3 by 4 m: the diagonal is 5. The heading is +y, so a box 1 m farther along y lies 1 m ahead.
+    proposal = np.array([[10.0, 0, -1, 3, 4, 2, math.pi / 2]])
+    box = np.array([[10.0, 1, -0.5, 6, 4, 1, math.pi / 2 + 0.1]])
+    expected = [1 / 5, 0, 0.5 / 2, math.log(2), 0, -math.log(2), 0.1]
+    assert encode_refinement(box, proposal)[0] == pytest.approx(expected, abs=1e-6)
+
+
+def test_no_boxes() -> None:
+    none = np.empty((0, 7), np.float32)
+    assert encode_refinement(none, none).shape == decode_refinement(none, none).shape == (0, 7)
+    assert roi_grid_points(none, 6).shape == (0, 216, 3)
+    assert math.prod(to_box_frames(np.empty((0, 4, 3)), none).shape) == 0
 
 
 def proposals(*rows: tuple[float, int]) -> Detections:
     """Cars moved along x from CAR by so many metres, with these labels."""
     boxes = np.stack([CAR + np.array([dx, 0, 0, 0, 0, 0, 0], np.float32) for dx, _ in rows])
     labels = np.array([label for _, label in rows], np.int64)
-    return Detections(boxes, np.full(len(rows), 0.5, np.float32), labels, NAMES)
+    return Detections(boxes, np.full(len(rows), 0.5, np.float32), labels, ("Car", "Pedestrian"))
 
 
 def overlaps(seed: int, count: int, kinds: int) -> Overlaps:
