@@ -29,7 +29,7 @@ CLASSES = ("Car", "Pedestrian", "Cyclist")
 @pytest.fixture(scope="module")
 def drives(tmp_path_factory: pytest.TempPathFactory) -> Path:
     config = load_simulation_config("vlp_16", "around")
-    return simulate_sequences(tmp_path_factory.mktemp("drives"), 2, 6, 2, 1, config, progress=False)
+    return simulate_sequences(tmp_path_factory.mktemp("drives"), 2, 6, 2, 1, config)
 
 
 def labels(drives: Path) -> list[dict[str, Any]]:
