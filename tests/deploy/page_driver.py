@@ -46,7 +46,7 @@ def wait_for(tab: Tab, state: str) -> None:
     assert found == state, tab.evaluate("document.getElementById('status').textContent")
 
 
-def assert_drawn(tab: Tab, path: Path, cars: int = 6) -> None:
+def assert_drawn(tab: Tab, path: Path, cars: int) -> None:
     """Points, boxes in the color of cars, and a label for each box."""
     tab.evaluate("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
     tab.screenshot(path)

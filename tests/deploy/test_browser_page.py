@@ -76,7 +76,7 @@ def test_the_browser_finds_the_boxes_that_python_finds(name: str, tmp_path: Path
         finished(tab, "sample.bin")
         set_sensor(tab)
         assert_same(finished(tab, "sample.bin"), detector, points)
-        assert_drawn(tab, tmp_path / "page.png")
+        assert_drawn(tab, tmp_path / "page.png", list(detector(points).names).count("Car"))
         for score in (0.2, 0.9, detector.spec.classes[0].score_threshold):
             move_slider(tab, "Car", score)
             moved = {"Car": score}
