@@ -163,8 +163,8 @@ ViewOption = Annotated[
     typer.Option(
         "--around/--ahead",
         help="Look in every direction, or only ahead. Default: in every direction if the first scan lies all around "
-        "the sensor, but not for KITTI's frames. A model of whole revolutions needs one pass, others several, each of "
-        "which costs what a scan ahead costs.",
+        "the sensor, but not for KITTI's frames and the sample. A model of whole revolutions needs one pass, others "
+        "several, each of which costs what a scan ahead costs.",
         show_default=False,
         rich_help_panel="Sensor",
     ),

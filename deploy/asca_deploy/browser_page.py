@@ -141,6 +141,7 @@ def _is_own_zip(path: Path) -> bool:
             if not first.filename.endswith(f"/{PAGE}") or first.file_size > _LARGEST_PAGE_BYTES:
                 return False
             content = json.loads(archive.read(first))
+    # zipfile raises NotImplementedError for compressions and RuntimeError for passwords that it does not know.
     except (zipfile.BadZipFile, zlib.error, IndexError, ValueError, NotImplementedError, RuntimeError, EOFError):
         return False
     return isinstance(content, dict) and all(key in content for key in _KEYS)

@@ -141,8 +141,7 @@ def detect_scans(
     files.check([*map(Path, chosen), *paths, times])
     births, weak = track_thresholds(options.bundle, score) if track else ({}, None)
     scan_input = ScanInput(reading, paths)
-    # The labels of the sample are those ahead.
-    around = scans is not None and files_need_around(options, scan_input) if around is None else around
+    around = files_need_around(options, scan_input) if around is None else around
     detector = open_detector(options, weak if track else score, scan_input.mounting, around=around)
     tracker = Tracker(birth_score=births) if track else None
     writer = None

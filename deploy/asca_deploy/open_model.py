@@ -13,7 +13,7 @@ from asca_deploy.around import turns_around, widen_ranges
 from asca_deploy.detector import Detector
 from asca_deploy.manifest import load_bundle
 from asca_deploy.providers import Precision, Provider, arithmetic
-from asca_deploy.shipped import find_bundle
+from asca_deploy.shipped import find_bundle, sample_scan_path
 from asca_deploy.tracker import WEAK_SHARE
 from asca_pillars.base.errors import ConfigError
 from asca_pillars.base.extras import require
@@ -89,12 +89,15 @@ def scans_need_around(
 
 
 def files_need_around(options: RuntimeOptions, scan_input: ScanInput) -> bool:
-    """Return `scans_need_around` of scan files, with its note; False for KITTI's, labelled in the camera's view alone.
+    """Return `scans_need_around` of scan files, with its note.
+
+    False for KITTI's frames and for the sample: they are labelled ahead alone.
 
     Raises:
         AscaError: the bundle cannot be read.
     """
-    if calibration_of_scan(scan_input.paths[0]) is not None:
+    first = scan_input.paths[0]
+    if first == sample_scan_path() or calibration_of_scan(first) is not None:
         return False
     return scans_need_around(options, scan_input.mounting, scan_input.samples(), scan_input.notes)
 

@@ -95,8 +95,7 @@ class ScanServer:
         named = name_scans(chosen)
         paths = [scan.path for scan in named]
         scan_input = ScanInput(reading, paths)
-        # The labels of the sample are those ahead.
-        around = scans is not None and files_need_around(options, scan_input) if around is None else around
+        around = files_need_around(options, scan_input) if around is None else around
         detector = open_detector(options, score, scan_input.mounting, around=around)
         thresholds = {one.name: one.score_threshold for one in detector.spec.classes}
         lowest = {

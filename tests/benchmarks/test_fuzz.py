@@ -1,4 +1,4 @@
-"""A short fuzz run over every reader and over what commands resume from, and that its judge can tell bad from good."""
+"""Every reader, and every file that a command resumes from, passes a short fuzz run, which tells bad from good."""
 
 import time
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""What programs that run `asca` go by: errors, exit codes, JSON, deadlines, what results say about the model."""
+"""Programs that run `asca` rely on its errors, exit codes, JSON, deadlines and on what results say about the model."""
 
 import errno
 import json

@@ -65,8 +65,9 @@ def test_all_around(tmp_path: Path) -> None:
 
 
 def test_what_is_behind_is_looked_at_or_said_to_be_left_out(tmp_path: Path, sample: NDArray[np.float32]) -> None:
-    write_scan(tmp_path / "ahead.bin", sample[sample[:, 0] > np.abs(sample[:, 1])])
-    scans = sample_scan_path(), tmp_path / "ahead.bin"
+    scans = tmp_path / "street.bin", tmp_path / "ahead.bin"
+    for path, points in zip(scans, (sample, sample[sample[:, 0] > np.abs(sample[:, 1])]), strict=True):
+        write_scan(path, points)
     result, found = detect(tmp_path, *scans, "--no-pictures")
     assert "49% of the points lie behind the sensor: looking all around, in 4 passes (--ahead:" in result.output
     assert [scan["passes"] for scan in found] == [4, 4] and not any(scan["warnings"] for scan in found)

@@ -146,4 +146,5 @@ def test_scans_all_around_the_sensor_are_looked_at_in_every_direction(tmp_path: 
         file.parent.mkdir()
         file.touch()
     revolution.tofile(in_kitti_layout)
-    assert not files_need_around(RuntimeOptions(), ScanInput(ScanSettings(), [in_kitti_layout]))
+    for labelled_ahead in (in_kitti_layout, sample_scan_path()):
+        assert not files_need_around(RuntimeOptions(), ScanInput(ScanSettings(), [labelled_ahead]))

@@ -107,7 +107,7 @@ def shown(page: Any, found: Any) -> list[Any]:
 
 def test_what_several_passes_find_is_not_lowered() -> None:
     """Of two passes the box stays that is seen nearest to straight ahead, whatever the scores."""
-    with serving([sample_scan_path()]) as server:
+    with serving([sample_scan_path()], around=True) as server:
         classes = json.loads(get(server, "page.json"))["classes"]
     assert [one["lowest"] for one in classes] == [one["score"] for one in classes]
 

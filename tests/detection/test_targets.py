@@ -66,7 +66,7 @@ def overlap_twin(boxes: np.ndarray, labels: np.ndarray) -> tuple[list[int], dict
 
 
 def candidates_twin(anchors: list[list[float]], box: list[float], label: int, count: int) -> list[int]:
-    """Of each yaw the nine nearest of all anchors of the class."""
+    """Return the nine nearest anchors of the class for each yaw."""
     chosen = []
     for kind in (2 * label, 2 * label + 1):
         own = range(kind, len(anchors), count)

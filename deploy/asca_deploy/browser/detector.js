@@ -55,7 +55,7 @@ export class Detector {
    * @returns {Promise<{detections: object[], passes: number, timesMs: object, counts: object, remarks: string[]}>}
    */
   async detect(points, around) {
-    const behind = percentBehind(this.field(false).grid, points);
+    const behind = around ? 0 : percentBehind(this.field(false).grid, points);
     const everywhere = around ?? behind > 0;
     const field = this.field(everywhere);
     const turns = everywhere ? turnsAround(field.spec.grid, this.manifest.expected_input.camera_view) : [turnBy(0)];

@@ -37,7 +37,7 @@ READINGS: tuple[CpaReading, ...] = ("none", "paper", "channel", "point", "linear
 
 @pytest.mark.parametrize("cpa", READINGS)
 def test_a_bundle_says_what_it_is_and_finds_what_its_checkpoint_finds(exported: Exports, cpa: CpaReading) -> None:
-    """Of one scan, for PyTorch takes seconds of attention among points."""
+    """One scan is compared, because PyTorch takes seconds of attention among points."""
     bundle = load_pillar_bundle(exported(cpa))
     assert bundle.spec == SPEC and bundle.pillar.cpa == cpa and bundle.provenance.steps == 0
     parity = bundle.parity

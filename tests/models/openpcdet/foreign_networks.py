@@ -130,7 +130,7 @@ def fully_connected(channels: int, hidden: int, out: int | None) -> nn.Sequentia
 
 
 def foreground(channels: int, hidden: int) -> nn.Sequential:
-    """Of the weights of keypoints."""
+    """Return the layers that weigh keypoints."""
     return nn.Sequential(
         *(nn.Linear(channels, hidden, bias=False), nn.BatchNorm1d(hidden), nn.ReLU()),
         *(nn.Linear(hidden, hidden, bias=False), nn.BatchNorm1d(hidden), nn.ReLU()),

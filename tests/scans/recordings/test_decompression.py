@@ -111,7 +111,7 @@ def rosbag2(folder: Path, storage: str, mode: str) -> Path:
 
 
 def times(path: Path) -> list[int]:
-    """Of the scans, all of which can be read."""
+    """Return the times of the scans, all of which can be read."""
     scans = read_scans(path)
     assert is_recording(path) and all(one.scan is not None for one in scans)
     return [one.time_ns for one in scans]
