@@ -155,6 +155,9 @@ class TrainConfig(Strict):
         precision: `fp32`, `bf16`, or `auto`: bf16 where the device has it.
         ema: decay of an exponential moving average of the weights, such as 0.999, that is validated, saved and
             exported in their place; 0 for none.
+        teacher: a trained pillar detector whose outputs are learnt beside the labels (arXiv 1503.02531): a checkpoint,
+            or a bundle that holds one (folder, or name of one that ships).
+        teacher_weight: weight of all terms that the teacher adds.
         checkpoint_steps: also save every so many steps, so that a kill costs minutes, not an epoch.
     """
 
@@ -170,13 +173,15 @@ class TrainConfig(Strict):
     gradient_clip: float = 10.0
     precision: Precision = "fp32"
     ema: float = 0.0
+    teacher: str | None = None
+    teacher_weight: float = 1.0
     checkpoint_steps: int = 500
     seed: int = 0
 
     def __post_init__(self) -> None:
         require_bounds("train", self, ("epochs", "batch_size", "decay_epochs", "checkpoint_steps"), low=1)
         require_bounds("train", self, ("learning_rate", "weight_decay", "decay", "gradient_clip", "seed"), low=0)
-        require_bounds("train", self, ("warmup_steps",), low=0)
+        require_bounds("train", self, ("warmup_steps", "teacher_weight"), low=0)
         require_bounds("train", self, ("cooldown",), low=0, high=1)
         for name in ("learning_rate", "decay"):
             if not getattr(self, name):

@@ -17,6 +17,7 @@ from asca_pillars.base.schema import to_dict
 from asca_pillars.config.tree import Config, Precision, TrainConfig
 from asca_pillars.evaluation.recall import RecallTally
 from asca_pillars.models.build import build_model
+from asca_pillars.models.pillar.distillation import Distillation
 from asca_pillars.scans.expected_input import ExpectedInput
 from asca_pillars.training.dataset import Batch
 
@@ -36,6 +37,7 @@ class DetectionModule(L.LightningModule):
         self.config = config
         self.detector = build_model(config.model)
         self.recall = RecallTally(config.model.spec.class_names)
+        self._distill = Distillation(config, config.train.teacher) if config.train.teacher else None
 
     def training_step(self, batch: Batch | AscaError, _: int) -> Tensor:
         """Return the loss of one batch, a scalar.
@@ -47,7 +49,10 @@ class DetectionModule(L.LightningModule):
         # Dropout depends on the step, so that a resumed run drops the same as an uninterrupted one.
         draws = np.random.SeedSequence((self.config.train.seed, self.global_step, self.global_rank))
         torch.manual_seed(int(draws.generate_state(1, np.uint64)[0]))
-        terms = self.detector.loss(self.detector.predict(batch.inputs), batch.inputs)
+        outputs = self.detector.predict(batch.inputs)
+        terms = self.detector.loss(outputs, batch.inputs)
+        if self._distill is not None:
+            terms = {**terms, **self._distill(outputs, batch.inputs)}
         total = _total(terms)
         self._require_finite(terms, batch)
         self.log_dict(_named(terms, "train"), batch_size=len(batch.frame_ids))

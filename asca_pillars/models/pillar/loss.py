@@ -153,14 +153,56 @@ def overlaps_found(residuals: Tensor, targets: TargetBatch) -> Tensor:
         return torch.from_numpy(paired_iou_3d(found, wanted)).to(residuals)
 
 
-def box_loss(residuals: Tensor, targets: Tensor, beta: float) -> Tensor:
+def box_loss(residuals: Tensor, targets: Tensor, beta: float, weights: Tensor | float = 1.0) -> Tensor:
     """Compute eq. (13), summed over residuals (K, 7): smooth L1 of six of them and of the sine of the yaw difference.
 
     The sine makes a box and the same box turned by half a circle equal; the direction bins tell them apart.
+    `weights`, (K, 1), are those of the boxes.
     """
-    position_size = F.smooth_l1_loss(residuals[:, :6], targets[:, :6], beta=beta, reduction="sum")
-    sine = torch.sin(residuals[:, 6] - targets[:, 6])
-    return position_size + F.smooth_l1_loss(sine, torch.zeros_like(sine), beta=beta, reduction="sum")
+    sine = torch.sin(residuals[:, 6:] - targets[:, 6:])
+    errors = torch.cat([residuals[:, :6] - targets[:, :6], sine], dim=1)
+    return (weights * F.smooth_l1_loss(errors, torch.zeros_like(errors), beta=beta, reduction="none")).sum()
+
+
+FOREGROUND_SCORE = 0.1
+"""Lowest score of a teacher's anchor whose box and direction are learnt; all others together would outweigh them."""
+
+
+class DistillationTerms(NamedTuple):
+    """Weighted terms of `distillation_loss`, scalars."""
+
+    teacher_box: Tensor
+    teacher_classification: Tensor
+    teacher_direction: Tensor
+
+
+def distillation_loss(maps: HeadMaps[Tensor], teacher: HeadMaps[Tensor], config: LossConfig) -> DistillationTerms:
+    """Compute how far head maps are from those of a trained detector (arXiv 1503.02531), with the weights of `config`.
+
+    The teacher's score is the target of every anchor's score in the quality focal loss (arXiv 2006.04388), without
+    alpha, because no anchor is positive or negative. Where it is at least FOREGROUND_SCORE it is also the weight with
+    which the teacher's box and direction are learnt. All terms are divided by the sum of these scores.
+
+    Args:
+        maps: of the detector that learns; whole maps or rows, as of `detection_loss`.
+        teacher: of the same anchors.
+        config: weights and shape parameters.
+    """
+    logits, scores = _by_anchor(maps.scores, values=1).float(), torch.sigmoid(_by_anchor(teacher.scores, 1).float())
+    cross_entropy = F.binary_cross_entropy_with_logits(logits, scores, reduction="none")
+    classification = (scores - torch.sigmoid(logits)).abs() ** config.focal_gamma * cross_entropy
+    foreground = scores[:, 0] >= FOREGROUND_SCORE
+    weights = scores[foreground]
+    total = weights.sum().clamp(min=1.0)
+    residuals, wanted = (_by_anchor(each.boxes, values=7)[foreground].float() for each in (maps, teacher))
+    directions, bins = (_by_anchor(each.directions, values=2)[foreground].float() for each in (maps, teacher))
+    box = box_loss(residuals, wanted, config.smooth_l1_beta, weights)
+    direction = weights[:, 0] * F.cross_entropy(directions, torch.softmax(bins, dim=1), reduction="none")
+    return DistillationTerms(
+        config.box_weight * box / total,
+        config.class_weight * classification.sum() / total,
+        config.direction_weight * direction.sum() / total,
+    )
 
 
 def _by_anchor(maps: Tensor, values: int) -> Tensor:

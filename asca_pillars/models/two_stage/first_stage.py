@@ -1,31 +1,21 @@
 """The first stage that a configuration names, in PyTorch: a checkpoint, or the weights that a bundle holds."""
 
-import hashlib
-import json
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from asca_pillars.base.errors import BundleError, ConfigError
-from asca_pillars.base.files import WEIGHTS_FILE
-from asca_pillars.base.input_files import read_text, require_content
-from asca_pillars.base.installation import find_shipped
-from asca_pillars.base.schema import parse
-from asca_pillars.config.pillar import PillarModel
+from asca_pillars.base.errors import ConfigError
 from asca_pillars.config.two_stage import RefineModel
 from asca_pillars.detection.decode import HeadMaps, PostProcess
-from asca_pillars.models.checkpoint_file import read_checkpoint, weights_sha256
-from asca_pillars.models.pillar.network import build_pillar_detector
 from asca_pillars.models.pillar.preparation import batch_pillars
+from asca_pillars.models.pillar.trained import load_trained_pillars
 from asca_pillars.ops.pillar.spec import PillarSpec
-from asca_pillars.ops.two_stage.first_stage import FirstStage, FirstStageOutputs, require_pillar_kind
-
-_MANIFEST = "bundle.json"
+from asca_pillars.ops.two_stage.first_stage import FirstStage, FirstStageOutputs
 
 
 class TorchFirstStage:
@@ -35,22 +25,12 @@ class TorchFirstStage:
         source: a checkpoint of `asca train`, or a bundle that holds one: its folder, or the name of one that ships.
 
     Raises:
-        TrainingError: not a checkpoint, damaged, or made by an incompatible version.
-        BundleError: the bundle is missing, damaged, or holds no checkpoint.
-        ConfigError: it is of another kind, or a bundle in 8 bits.
+        AscaError: as `load_trained_pillars`.
     """
 
     def __init__(self, source: str) -> None:
         self._source = source
-        found = _find_weights(source)
-        checkpoint = read_checkpoint(found.path)
-        model = checkpoint.config.model
-        require_pillar_kind(source, model.kind)
-        assert isinstance(model, PillarModel), "it is of kind pillar"
-        self.spec = model.spec if found.spec is None else found.spec
-        self._network = build_pillar_detector(replace(model, spec=self.spec)).eval()
-        checkpoint.fill(self._network)
-        self.identity = found.identity or weights_sha256(self._network.state_dict())
+        self._network, self.spec, self.identity = load_trained_pillars(source, "model.first_stage")
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle as its source, from which the other process reads it."""
@@ -124,45 +104,3 @@ def with_first_stage(model: RefineModel, stage: FirstStage | None = None) -> Ref
 def _geometry(spec: PillarSpec) -> PillarSpec:
     """Return the spec without thresholds and suppression, which are those of the second stage."""
     return replace(spec.with_score_threshold(0.0), post=PostProcess())
-
-
-class _Weights(NamedTuple):
-    """Checkpoint of a first stage, with spec and identity of the bundle that holds it, if any."""
-
-    path: Path
-    spec: PillarSpec | None = None
-    identity: str = ""
-    """Identifier of the trained weights; the bundle's are rounded from them."""
-
-
-def _find_weights(source: str) -> _Weights:
-    path = Path(source)
-    if path.suffix == Path(WEIGHTS_FILE).suffix or path.is_file():
-        return _Weights(path)
-    folder = path if path.exists() else find_shipped(source)
-    if folder is None:
-        raise BundleError(
-            f"{source}: no such bundle or checkpoint; set model.first_stage to the folder of one that was exported "
-            "with --with-weights, or to RUN/checkpoints/last.ckpt"
-        )
-    weights, manifest = folder / WEIGHTS_FILE, folder / _MANIFEST
-    if not manifest.is_file():
-        return _Weights(weights)
-    try:
-        data = json.loads(read_text(manifest, BundleError))
-        kind, precision, provenance = str(data["kind"]), data["precision"], data["provenance"]
-        identity, digest = (str(provenance.get(key) or "") for key in ("weights_sha256", "weights_file_sha256"))
-    except (OSError, ValueError, KeyError, TypeError, AttributeError):
-        raise BundleError(f"{manifest}: cannot be read, or is damaged; copy the whole bundle again") from None
-    require_pillar_kind(folder, kind)
-    if precision != "float32":
-        raise ConfigError(f"{folder}: a bundle in {precision}; give one in float32")
-    require_content(weights, BundleError)
-    if not weights.is_file():
-        raise BundleError(
-            f"{folder}: holds no {WEIGHTS_FILE}, which a second stage is trained on; set model.first_stage to its "
-            "checkpoint, or export it again with --with-weights"
-        )
-    if digest and hashlib.sha256(weights.read_bytes()).hexdigest() != digest:
-        raise BundleError(f"{weights}: is damaged, or of another bundle; copy the whole bundle again")
-    return _Weights(weights, parse(PillarSpec, data["spec"], str(manifest)), identity)

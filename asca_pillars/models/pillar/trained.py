@@ -1,0 +1,99 @@
+"""A trained pillar detector that a setting names: a checkpoint, or the weights that a bundle holds."""
+
+import hashlib
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
+
+from asca_pillars.base.errors import BundleError, ConfigError
+from asca_pillars.base.files import WEIGHTS_FILE
+from asca_pillars.base.input_files import read_text, require_content
+from asca_pillars.base.installation import find_shipped
+from asca_pillars.base.schema import parse
+from asca_pillars.config.pillar import PillarModel
+from asca_pillars.models.checkpoint_file import read_checkpoint, weights_sha256
+from asca_pillars.models.pillar.network import PillarDetector, build_pillar_detector
+from asca_pillars.ops.pillar.spec import PillarSpec
+from asca_pillars.ops.two_stage.first_stage import require_pillar_kind
+
+_MANIFEST = "bundle.json"
+
+
+class TrainedPillars(NamedTuple):
+    """A trained pillar detector in evaluation mode, on the CPU.
+
+    Attributes:
+        network: with its weights.
+        spec: of the bundle, or of the checkpoint's configuration.
+        identity: digest of the trained weights; those of a bundle are rounded from them.
+    """
+
+    network: PillarDetector
+    spec: PillarSpec
+    identity: str
+
+
+def load_trained_pillars(source: str, key: str) -> TrainedPillars:
+    """Load a trained pillar detector.
+
+    Args:
+        source: a checkpoint of `asca train`, or a bundle that holds one: its folder, or the name of one that ships.
+        key: the setting that names it, for messages.
+
+    Raises:
+        TrainingError: not a checkpoint, damaged, or made by an incompatible version.
+        BundleError: the bundle is missing, damaged, or holds no checkpoint.
+        ConfigError: it is of another kind, or a bundle in 8 bits.
+    """
+    found = _find_weights(source, key)
+    checkpoint = read_checkpoint(found.path)
+    model = checkpoint.config.model
+    require_pillar_kind(source, model.kind)
+    assert isinstance(model, PillarModel), "it is of kind pillar"
+    spec = model.spec if found.spec is None else found.spec
+    network = build_pillar_detector(replace(model, spec=spec)).eval()
+    checkpoint.fill(network)
+    return TrainedPillars(network, spec, found.identity or weights_sha256(network.state_dict()))
+
+
+class _Weights(NamedTuple):
+    """A checkpoint, with spec and identity of the bundle that holds it, if any."""
+
+    path: Path
+    spec: PillarSpec | None = None
+    identity: str = ""
+    """Identifier of the trained weights; the bundle's are rounded from them."""
+
+
+def _find_weights(source: str, key: str) -> _Weights:
+    path = Path(source)
+    if path.suffix == Path(WEIGHTS_FILE).suffix or path.is_file():
+        return _Weights(path)
+    folder = path if path.exists() else find_shipped(source)
+    if folder is None:
+        raise BundleError(
+            f"{source}: no such bundle or checkpoint; set {key} to the folder of one that was exported "
+            "with --with-weights, or to RUN/checkpoints/last.ckpt"
+        )
+    weights, manifest = folder / WEIGHTS_FILE, folder / _MANIFEST
+    if not manifest.is_file():
+        return _Weights(weights)
+    try:
+        data = json.loads(read_text(manifest, BundleError))
+        kind, precision, provenance = str(data["kind"]), data["precision"], data["provenance"]
+        identity, digest = (str(provenance.get(key) or "") for key in ("weights_sha256", "weights_file_sha256"))
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        raise BundleError(f"{manifest}: cannot be read, or is damaged; copy the whole bundle again") from None
+    require_pillar_kind(folder, kind)
+    if precision != "float32":
+        raise ConfigError(f"{folder}: a bundle in {precision}; give one in float32")
+    require_content(weights, BundleError)
+    if not weights.is_file():
+        raise BundleError(
+            f"{folder}: holds no {WEIGHTS_FILE}, from which its network is built; set {key} to its checkpoint, or "
+            "export it again with --with-weights"
+        )
+    if digest and hashlib.sha256(weights.read_bytes()).hexdigest() != digest:
+        raise BundleError(f"{weights}: is damaged, or of another bundle; copy the whole bundle again")
+    return _Weights(weights, parse(PillarSpec, data["spec"], str(manifest)), identity)
