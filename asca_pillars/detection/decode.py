@@ -13,7 +13,7 @@ from asca_pillars.base.kernels import load_kernels
 from asca_pillars.base.strict import Strict
 from asca_pillars.detection.anchors import ANCHOR_YAWS_RAD, ClassSpec
 from asca_pillars.detection.detections import Detections
-from asca_pillars.geometry.boxes import DIRECTION_OFFSET_RAD, decode_boxes
+from asca_pillars.geometry.boxes import DIRECTION_OFFSET_RAD, decode_boxes, wrap_angle
 
 KERNELS = "asca_pillars.geometry.nms_kernels"
 
@@ -34,10 +34,14 @@ class PostProcess(Strict):
     """Best boxes of each class that enter the suppression."""
     max_detections: int = 100
     """Best boxes of a scan that are reported."""
+    vote_iou: float | None = None
+    """BEV IoU from which on a suppressed box has a vote on the one that is kept, see `vote_boxes`; None: none has."""
 
     def __post_init__(self) -> None:
-        if not 0 <= self.nms_iou <= 1:
-            raise ConfigError(f"nms_iou {self.nms_iou:g} must lie between 0 and 1")
+        for name in ("nms_iou", "vote_iou"):
+            value = getattr(self, name)
+            if value is not None and not 0 <= value <= 1:
+                raise ConfigError(f"{name} {value:g} must lie between 0 and 1")
         for name in ("candidates", "max_detections"):
             if not 1 <= getattr(self, name) <= MOST:
                 raise ConfigError(f"{name} {reprlib.repr(getattr(self, name))} must lie between 1 and {MOST}")
@@ -86,8 +90,8 @@ def decode(
     """Decode the detections of one scan, best first.
 
     Per class: the anchors whose score reaches the class's threshold, the best `candidates` of them, decoded,
-    rotated BEV NMS. Then the best `max_detections` of all classes. Anchors whose numbers are not finite,
-    from a network that overflowed, are left out and counted (`Detections.non_finite`).
+    rotated BEV NMS, and with `vote_iou` box voting. Then the best `max_detections` of all classes. Anchors whose
+    numbers are not finite, from a network that overflowed, are left out and counted (`Detections.non_finite`).
 
     Args:
         maps: logits and residuals on the head's map.
@@ -153,15 +157,16 @@ def suppress(
 ) -> Detections:
     """Suppress (n, 7) candidates by the rotated NMS of their class, the second half of `decode`; best first.
 
-    At most `most` of each class are kept.
+    At most `most` of each class are kept. With `post.vote_iou` the others vote on their boxes.
     """
     boxes, logits, labels, non_finite = candidates
     limit = post.max_detections if most is None else min(most, post.max_detections)
     survivors = nms_by_class(boxes, logits, labels, post.nms_iou, limit)
     best = survivors[np.argsort(-logits[survivors], kind="stable")[: post.max_detections]]
+    scores = sigmoid(logits)
     return Detections(
-        boxes[best],
-        sigmoid(logits[best]),
+        vote_boxes(boxes, scores, labels, best, post.vote_iou),
+        scores[best],
         labels[best],
         tuple(spec.name for spec in classes),
         non_finite=non_finite,
@@ -198,6 +203,35 @@ def rotated_nms(
     order = np.argsort(-scores, kind="stable")
     nms = load_kernels(KERNELS).nms
     return order[nms(boxes[order].astype(np.float64, order="C"), iou_threshold, len(boxes) if limit is None else limit)]
+
+
+def vote_boxes(
+    boxes: NDArray[np.float32],
+    scores: NDArray[np.float32],
+    labels: NDArray[np.int64],
+    kept: NDArray[np.int64],
+    iou_threshold: float | None,
+) -> NDArray[np.float32]:
+    """Return the kept boxes (K, 7), each the weighted mean of the boxes of its class that overlap it (box voting).
+
+    A box votes from a BEV IoU of `iou_threshold` with the kept one on, with the square of its score times this IoU
+    (Gidaris and Komodakis, arXiv 1505.01749, where the score alone is the weight). Headings are averaged modulo
+    half a turn: which end is the front stays.
+
+    Args:
+        boxes: (N, 7), LiDAR frame, finite.
+        scores: (N,) in [0, 1].
+        labels: (N,) indices into the classes.
+        kept: (K,) rows of `boxes` that suppression kept.
+        iou_threshold: None leaves the boxes as they are.
+    """
+    if iou_threshold is None or not len(kept):
+        return boxes[kept]
+    vote = load_kernels(KERNELS).vote
+    weights = scores.astype(np.float64) ** 2
+    voted = vote(boxes.astype(np.float64), weights, labels, kept, iou_threshold).astype(np.float32)
+    voted[:, 6] = wrap_angle(voted[:, 6])
+    return voted  # type: ignore[no-any-return]
 
 
 def _candidates(

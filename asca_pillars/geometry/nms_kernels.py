@@ -1,4 +1,4 @@
-"""Loop of `rotated_nms`, compiled; tests/ops/numpy_kernels.py has the NumPy version.
+"""Loops of `rotated_nms` and `vote_boxes`, compiled; tests/ops/numpy_kernels.py has the first one's NumPy version.
 
 The cosine of the angle between two boxes is computed from their own sines and cosines, so overlaps differ in their
 last digits: the same boxes are kept unless an overlap is within 1e-12 or so of the threshold.
@@ -18,6 +18,13 @@ def nms(boxes: Floats, iou_threshold: float, limit: int) -> Ints:
     kept = np.empty(len(boxes), np.int64)
     count = _nms(boxes, iou_threshold, limit, np.empty((len(boxes), 3)), np.empty((len(boxes), 5)), kept)
     return kept[:count]
+
+
+def vote(boxes: Floats, weights: Floats, labels: Ints, kept: Ints, iou_threshold: float) -> Floats:
+    """Average boxes (N, 7) as `vote_boxes` -> (K, 7) for the rows `kept` (K,) of them."""
+    voted = np.empty((len(kept), 7))
+    _vote(boxes, weights, labels, kept, iou_threshold, voted)
+    return voted
 
 
 @inner
@@ -95,3 +102,36 @@ def _nms(boxes: Floats, iou_threshold: float, limit: int, circles: Floats, shape
             kept[count] = i
             count += 1
     return count
+
+
+@compiled(
+    *(in_array(types.float64, 2), in_array(types.float64), in_array(types.int64), in_array(types.int64)),
+    *(types.float64, out_array(types.float64, 2)),
+)
+def _vote(boxes: Floats, weights: Floats, labels: Ints, kept: Ints, iou_threshold: float, voted: Floats) -> None:
+    for row in range(len(kept)):
+        own = kept[row]
+        al, aw, yaw = boxes[own, 3] / 2, boxes[own, 4] / 2, boxes[own, 6]
+        cos, sin, reach = math.cos(yaw), math.sin(yaw), math.hypot(al, aw)
+        total = weights[own]
+        voted[row] = 0.0  # sums of weighted differences from the kept box
+        for k in range(len(boxes)):
+            bl, bw = boxes[k, 3] / 2, boxes[k, 4] / 2
+            dx, dy, reaches = boxes[k, 0] - boxes[own, 0], boxes[k, 1] - boxes[own, 1], math.hypot(bl, bw) + reach
+            if k == own or labels[k] != labels[own] or dx * dx + dy * dy >= reaches * reaches:
+                continue
+            turn = boxes[k, 6] - yaw
+            # The other box in the frame of the kept one.
+            x, y = cos * dx + sin * dy, cos * dy - sin * dx
+            shared = _shared_area(x, y, math.cos(turn), math.sin(turn), bl, bw, al, aw)
+            union = 4 * (al * aw + bl * bw) - shared
+            if not (union > 0 and shared / union >= iou_threshold):
+                continue
+            weight = weights[k] * shared / union
+            total += weight
+            for axis in range(6):
+                voted[row, axis] += weight * (boxes[k, axis] - boxes[own, axis])
+            # Half a turn does not change a footprint: the kept box alone says which end is the front.
+            voted[row, 6] += weight * (turn - math.pi * math.floor(turn / math.pi + 0.5))
+        for axis in range(7):
+            voted[row, axis] = boxes[own, axis] + (voted[row, axis] / total if total > 0 else 0.0)

@@ -1,10 +1,11 @@
-// Head maps -> boxes: threshold, decode, rotated non-maximum suppression (asca_pillars/detection/decode.py).
+// Head maps -> boxes: threshold, decode, rotated non-maximum suppression, votes (asca_pillars/detection/decode.py).
 #pragma once
 
 #include <algorithm>
 #include <array>
 #include <cmath>
 #include <cstdint>
+#include <optional>
 #include <tuple>
 #include <vector>
 
@@ -86,6 +87,29 @@ inline double bev_iou(const Box& a, const Box& b) {
     return sum > 0 ? shared / sum : 0;
 }
 
+// The mean of the boxes of its class that overlap a kept one, weighted with score squared and overlap.
+inline Box voted(const Box& own, const std::vector<Box>& candidates, double iou_threshold) {
+    std::array<double, 7> sums{};
+    double total = 0;
+    for (const Box& other : candidates) {
+        const double iou = bev_iou(own, other);
+        if (iou < iou_threshold) continue;
+        const double weight = other.score * other.score * iou;
+        total += weight;
+        for (int axis = 0; axis < 7; ++axis) {
+            double step = double{other.values[axis]} - own.values[axis];
+            // Half a turn does not change a footprint: the kept box alone says which end is the front.
+            if (axis == 6) step -= kPi * std::floor(step / kPi + 0.5);
+            sums[axis] += weight * step;
+        }
+    }
+    Box box = own;
+    if (total > 0)
+        for (int axis = 0; axis < 7; ++axis) box.values[axis] = static_cast<float>(own.values[axis] + sums[axis] / total);
+    box.values[6] = static_cast<float>(modulo(double{box.values[6]} + kPi, 2 * kPi) - kPi);
+    return box;
+}
+
 }  // namespace detail
 
 // The boxes of one scan, best first. Maps are channels last, or rows of the head cells that `cells` names, ascending;
@@ -101,6 +125,9 @@ inline std::vector<Box> detections(const float* scores, const float* residuals, 
     const int64_t anchors = static_cast<int64_t>(classes.size()) * turns;
     const size_t candidates = spec.at("post").at("candidates"), most = spec.at("post").at("max_detections");
     const double nms_iou = spec.at("post").at("nms_iou");
+    const auto votes = spec.at("post").find("vote_iou");
+    const auto vote_iou = votes == spec.at("post").end() || votes->is_null() ? std::nullopt
+                                                                                 : std::optional(votes->get<double>());
     const double direction_offset = spec.value("direction_offset_rad", detail::kPi / 4);
     std::vector<Box> all;
     for (size_t label = 0; label < classes.size(); ++label) {
@@ -114,7 +141,7 @@ inline std::vector<Box> detections(const float* scores, const float* residuals, 
                     chosen.emplace_back(-logit, anchor, row);
         std::sort(chosen.begin(), chosen.end());
         if (chosen.size() > candidates) chosen.resize(candidates);
-        std::vector<Box> kept;
+        std::vector<Box> kept, entered;
         for (const auto& [negative, anchor, row] : chosen) {
             const int64_t cell = cells ? (*cells)[row] : row;
             const std::array<float, 7> box{grid.head_column_centers[cell % columns],
@@ -131,9 +158,10 @@ inline std::vector<Box> detections(const float* scores, const float* residuals, 
             const bool finite = std::all_of(found.values.begin(), found.values.end(),
                                             [](float value) { return std::isfinite(value); });
             const auto clashes = [&](const Box& other) { return detail::bev_iou(other, found) > nms_iou; };
+            if (finite) entered.push_back(found);
             if (finite && kept.size() < most && std::none_of(kept.begin(), kept.end(), clashes)) kept.push_back(found);
         }
-        all.insert(all.end(), kept.begin(), kept.end());
+        for (const Box& own : kept) all.push_back(vote_iou ? detail::voted(own, entered, *vote_iou) : own);
     }
     std::stable_sort(all.begin(), all.end(), [](const Box& a, const Box& b) { return a.score > b.score; });
     if (all.size() > most) all.resize(most);

@@ -16,6 +16,7 @@ from asca_pillars.base.errors import ConfigError, TrainingError
 from asca_pillars.base.extras import require
 from asca_pillars.base.own_files import require_not_input, require_replaceable
 from asca_pillars.base.progress import Progress, Reporter
+from asca_pillars.detection.decode import PostProcess
 from asca_pillars.detection.spec import DetectorSpec, ScoreThresholds
 from asca_pillars.ops.pillar.spec import PillarSpec
 from asca_pillars.scans.find_scans import find_scans
@@ -39,6 +40,8 @@ class Source(NamedTuple):
     score_thresholds: dict[str, float]
     """Thresholds by class of the bundle that holds the checkpoint; empty for other checkpoints, whose config has
     them."""
+    post: PostProcess | None
+    """Suppression and votes of this bundle; None for other checkpoints."""
     trained_on: str
     command: str
     """The command that trained it."""
@@ -51,6 +54,7 @@ def export(
     scans: str | Path | None = None,
     trained_on: str | None = None,
     score: ScoreThresholds | None = None,
+    vote_iou: float | None = None,
     range_m: tuple[float, float, float, float] | None = None,
     int8: bool = False,
     calibrate: str | Path | None = None,
@@ -67,6 +71,7 @@ def export(
         scans: like those trained on, to compare on; None: simulated ones.
         trained_on: training data in words, for the manifest; None: from the bundle that holds the weights.
         score: thresholds of the bundle; None: those of the checkpoint.
+        vote_iou: `PostProcess.vote_iou` of the bundle; None: that of the checkpoint.
         range_m: detection range of the bundle, x0 x1 y0 y1 in metres; None: as trained.
         int8: make the graphs 8-bit ones.
         calibrate: scans to calibrate these with; None: simulated ones.
@@ -94,6 +99,10 @@ def export(
     spec = loaded.config.model.spec.with_score_threshold(source.score_thresholds)
     if score is not None:
         spec = spec.with_score_threshold(score)
+    if source.post is not None:
+        spec = replace(spec, post=source.post)
+    if vote_iou is not None:
+        spec = replace(spec, post=replace(spec.post, vote_iou=vote_iou))
     if range_m is not None:
         spec = with_ranges(spec, range_m)
     model = replace(loaded.config.model, spec=spec)  # type: ignore[arg-type]  # of the same kind
@@ -138,10 +147,10 @@ def open_source(source: Path) -> Source:
         source = path
     if path == source:
         command = run_environment(source).get("command", "not recorded")
-        return Source(path, checkpoint, {}, "not stated", command)
+        return Source(path, checkpoint, {}, None, "not stated", command)
     bundle = load_bundle(path.parent)
     scores = {each.name: each.score_threshold for each in bundle.spec.classes}
-    return Source(path, checkpoint, scores, bundle.provenance.trained_on, bundle.provenance.command)
+    return Source(path, checkpoint, scores, bundle.spec.post, bundle.provenance.trained_on, bundle.provenance.command)
 
 
 def with_ranges(spec: DetectorSpec, range_m: tuple[float, float, float, float]) -> PillarSpec:

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from asca_pillars.base.errors import ConfigError
 from asca_pillars.detection.anchors import KITTI_CLASSES, make_anchors
-from asca_pillars.detection.decode import HeadMaps, PostProcess, decode, rotated_nms
+from asca_pillars.detection.decode import HeadMaps, PostProcess, decode, rotated_nms, vote_boxes
 from asca_pillars.geometry.boxes import decode_boxes, encode_boxes
 from asca_pillars.geometry.overlap import bev_iou
 from asca_pillars.ops.pillar.grid import PillarGrid
@@ -198,3 +198,53 @@ def test_suppression_equals_its_definition(
     kept = rotated_nms(boxes, scores, threshold)
     assert kept.dtype == np.int64
     assert kept.tolist() == nms_twin(boxes, scores, threshold)
+
+
+def vote_twin(boxes: np.ndarray, scores: np.ndarray, labels: np.ndarray, kept: int, threshold: float) -> np.ndarray:
+    """The weighted mean of one kept box's voters, by `bev_iou`; its heading as an angle of a line."""
+    overlaps = bev_iou(boxes[[kept]], boxes)[0]
+    voters = np.flatnonzero((labels == labels[kept]) & (overlaps >= threshold))
+    weights = scores[voters] ** 2 * overlaps[voters]
+    mean = weights @ boxes[voters].astype(np.float64) / weights.sum()
+    turns = [math.remainder(boxes[voter, 6] - boxes[kept, 6], math.pi) for voter in voters]
+    mean[6] = math.remainder(boxes[kept, 6] + weights @ turns / weights.sum(), 2 * math.pi)
+    return mean
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(1, 30), st.sampled_from([0.2, 0.5, 0.8]))
+@settings(max_examples=60, deadline=None)
+def test_votes_are_weighted_means_of_overlapping_boxes_of_a_class(seed: int, count: int, threshold: float) -> None:
+    rng = np.random.default_rng(seed)
+    boxes = np.repeat(random_boxes(seed, max(1, count // 5), 10.0), 5, axis=0)[:count]
+    boxes = (boxes + rng.normal(0, 0.1, boxes.shape)).astype(np.float32)
+    boxes[:, 3:6] = np.abs(boxes[:, 3:6]) + 0.5
+    boxes[:, 6] += math.pi * rng.integers(-1, 2, len(boxes))
+    scores, labels = rng.uniform(0.1, 1, len(boxes)).astype(np.float32), rng.integers(0, 2, len(boxes))
+    kept = rng.permutation(len(boxes))[:4]
+    overlaps = bev_iou(boxes[kept], boxes)
+    turns = np.abs([[math.remainder(b[6] - boxes[k, 6], math.pi) for b in boxes] for k in kept])
+    if (np.abs(overlaps - threshold) < 1e-6).any() or (np.abs(turns - math.pi / 2) < 1e-4).any():
+        return  # a tie, which rounding decides
+    voted = vote_boxes(boxes, scores, labels, kept, threshold)
+    expected = np.array([vote_twin(boxes, scores, labels, row, threshold) for row in kept])
+    np.testing.assert_allclose(voted[:, :6], expected[:, :6], atol=1e-4)
+    np.testing.assert_allclose(np.cos(voted[:, 6] - expected[:, 6]), 1, atol=1e-6)
+    assert (np.abs(voted[:, 6]) <= math.pi).all()
+
+
+def test_only_with_votes_does_suppression_change_a_box() -> None:
+    """Two anchors that see one car 0.4 m apart: the better one is reported, in between with votes."""
+    maps, center = quiet_maps(), ANCHORS[HEIGHT // 2, WIDTH // 2, 0].astype(np.float64)
+    other = center + np.eye(7)[0] * 0.4
+    write(maps, 0, HEIGHT // 2, WIDTH // 2, center, 2.0)
+    write(maps, 0, HEIGHT // 2, WIDTH // 2 + 1, other, 1.0)
+    (alone,), (voted,) = (
+        decode(maps, ANCHORS, CLASSES, PostProcess(vote_iou=vote_iou)).boxes for vote_iou in (None, 0.6)
+    )
+    np.testing.assert_allclose(alone, center, atol=1e-5)
+    overlap = bev_iou(center[None], other[None])[0, 0]
+    weights = np.array([1 / (1 + math.exp(-2)) ** 2, overlap / (1 + math.exp(-1)) ** 2])
+    np.testing.assert_allclose(voted[0] - center[0], 0.4 * weights[1] / weights.sum(), atol=1e-5)
+    np.testing.assert_allclose(voted[1:], center[1:], atol=1e-5)
+    with pytest.raises(ConfigError, match=r"vote_iou 1\.5 must lie between 0 and 1"):
+        PostProcess(vote_iou=1.5)

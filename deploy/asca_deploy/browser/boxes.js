@@ -1,4 +1,4 @@
-/** Head maps -> boxes: threshold, decode, rotated non-maximum suppression (asca_pillars/detection/decode.py). */
+/** Head maps -> boxes: threshold, decode, rotated non-maximum suppression, votes (asca_pillars/detection/decode.py). */
 
 const DIRECTION_OFFSET = Math.PI / 4; // where bundle.json does not say
 const MAX_LOG_RATIO = Math.log(100);
@@ -63,7 +63,7 @@ function decodeBox(maps, place, [x, y, z, length, width, height, yaw], offset) {
 /**
  * Rotated non-maximum suppression within each class, seen from above; then the best of all classes, best first.
  * @param {{box: Float32Array, score: number, label: number}[]} candidates of `decodeCandidates`
- * @param {{nms_iou: number, max_detections: number}} post `spec.post` of bundle.json
+ * @param {{nms_iou: number, max_detections: number, vote_iou: ?number}} post `spec.post` of bundle.json
  */
 export function suppress(candidates, post) {
   const kept = [];
@@ -73,7 +73,30 @@ export function suppress(candidates, post) {
       kept.push(candidate);
     }
   }
-  return kept.sort((a, b) => b.score - a.score).slice(0, post.max_detections);
+  const best = kept.sort((a, b) => b.score - a.score).slice(0, post.max_detections);
+  return post.vote_iou == null ? best : best.map((own) => ({ ...own, box: votedBox(own, candidates, post.vote_iou) }));
+}
+
+/** The mean of the boxes of its class that overlap a kept one, weighted with score squared and overlap: `vote_boxes`. */
+function votedBox(own, candidates, iouThreshold) {
+  const sums = new Float64Array(7);
+  let total = 0;
+  for (const other of candidates) {
+    if (other.label !== own.label) continue;
+    const iou = bevIou(own.box, other.box);
+    if (iou < iouThreshold) continue;
+    const weight = other.score ** 2 * iou;
+    total += weight;
+    other.box.forEach((value, axis) => {
+      const difference = value - own.box[axis];
+      // Half a turn does not change a footprint: the kept box alone says which end is the front.
+      const step = axis < 6 ? difference : difference - Math.PI * Math.floor(difference / Math.PI + 0.5);
+      sums[axis] += weight * step;
+    });
+  }
+  const box = own.box.map((value, axis) => value + (total > 0 ? sums[axis] / total : 0));
+  box[6] = modulo(box[6] + Math.PI, 2 * Math.PI) - Math.PI;
+  return box;
 }
 
 /** Intersection over union of the footprints of two boxes. */
