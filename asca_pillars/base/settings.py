@@ -8,7 +8,7 @@ import yaml
 
 from asca_pillars.base.errors import ConfigError
 from asca_pillars.base.input_files import read_text
-from asca_pillars.base.schema import parse
+from asca_pillars.base.schema import parse, to_dict
 
 MAX_CHARACTERS, MAX_DEPTH = 100_000, 30
 
@@ -94,6 +94,23 @@ def read_settings(type_: type[T], path: str | Path, overrides: Sequence[str], sh
     for override in overrides:
         _apply(data, override)
     return parse(type_, data, f"{path} with {' '.join(overrides)}")
+
+
+def with_overrides(settings: T, overrides: Sequence[str], source: str) -> T:
+    """Return settings with other values.
+
+    Args:
+        settings: a dataclass.
+        overrides: `key.subkey=value` texts, value in YAML notation.
+        source: the command-line option to name in the error.
+
+    Raises:
+        ConfigError: an unknown key anywhere (the nearest is named), an impossible value.
+    """
+    data = to_dict(settings)
+    for override in overrides:
+        _apply(data, override)
+    return parse(type(settings), data, source)
 
 
 def _apply(data: dict[str, Any], override: str) -> None:

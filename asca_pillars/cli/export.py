@@ -92,13 +92,13 @@ def export(
     ] = False,
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder to be written.", rich_help_panel="Output")],
     score: ScoreOption = None,
-    vote_iou: Annotated[
-        float | None,
+    post: Annotated[
+        list[str] | None,
         typer.Option(
-            "--vote-iou",
-            metavar="IOU",
-            help="Average each box with those suppressed for it that overlap it by at least this BEV IoU, such "
-            "as 0.6. Default: the checkpoint's.",
+            "--post",
+            metavar="KEY=VALUE",
+            help="Suppression of overlapping boxes: nms_iou, candidates, max_detections, vote_iou (docs/BUNDLE.md). "
+            "Repeatable. Default: the checkpoint's.",
             rich_help_panel="Bundle",
         ),
     ] = None,
@@ -140,7 +140,7 @@ def export(
         of_a_checkpoint = {
             "--trained-on": trained_on,
             "--score": score,
-            "--vote-iou": vote_iou,
+            "--post": post,
             "--range": range_m,
             "--int8": int8,
             "--calibrate": calibrate,
@@ -163,7 +163,7 @@ def export(
             scans=scans,
             trained_on=trained_on,
             score=read_scores(score),
-            vote_iou=vote_iou,
+            post=post or (),
             range_m=range_m,
             int8=int8,
             calibrate=calibrate,

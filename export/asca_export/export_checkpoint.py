@@ -1,7 +1,7 @@
 """Export of a checkpoint, or of a bundle that holds its weights: `asca export`."""
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
@@ -16,6 +16,7 @@ from asca_pillars.base.errors import ConfigError, TrainingError
 from asca_pillars.base.extras import require
 from asca_pillars.base.own_files import require_not_input, require_replaceable
 from asca_pillars.base.progress import Progress, Reporter
+from asca_pillars.base.settings import with_overrides
 from asca_pillars.detection.decode import PostProcess
 from asca_pillars.detection.spec import DetectorSpec, ScoreThresholds
 from asca_pillars.ops.pillar.spec import PillarSpec
@@ -54,7 +55,7 @@ def export(
     scans: str | Path | None = None,
     trained_on: str | None = None,
     score: ScoreThresholds | None = None,
-    vote_iou: float | None = None,
+    post: Sequence[str] = (),
     range_m: tuple[float, float, float, float] | None = None,
     int8: bool = False,
     calibrate: str | Path | None = None,
@@ -71,7 +72,7 @@ def export(
         scans: like those trained on, to compare on; None: simulated ones.
         trained_on: training data in words, for the manifest; None: from the bundle that holds the weights.
         score: thresholds of the bundle; None: those of the checkpoint.
-        vote_iou: `PostProcess.vote_iou` of the bundle; None: that of the checkpoint.
+        post: `key=value` texts of `PostProcess` that differ in the bundle from those of the checkpoint.
         range_m: detection range of the bundle, x0 x1 y0 y1 in metres; None: as trained.
         int8: make the graphs 8-bit ones.
         calibrate: scans to calibrate these with; None: simulated ones.
@@ -101,8 +102,8 @@ def export(
         spec = spec.with_score_threshold(score)
     if source.post is not None:
         spec = replace(spec, post=source.post)
-    if vote_iou is not None:
-        spec = replace(spec, post=replace(spec.post, vote_iou=vote_iou))
+    if post:
+        spec = replace(spec, post=with_overrides(spec.post, post, f"--post {' --post '.join(post)}"))
     if range_m is not None:
         spec = with_ranges(spec, range_m)
     model = replace(loaded.config.model, spec=spec)  # type: ignore[arg-type]  # of the same kind
