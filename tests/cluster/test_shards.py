@@ -56,21 +56,15 @@ def test_parts_become_the_shard(tmp_path: Path) -> None:
     assert list(folder.lines([shard])) == ["a\n", "b\n", "c\n"]
 
 
-def flipped(content: bytes) -> bytes:
-    middle = len(content) // 2
-    return content[:middle] + bytes([content[middle] ^ 1]) + content[middle + 1 :]
-
-
 @pytest.mark.parametrize(
     "damage",
     [
         lambda content: b"".join(content.splitlines(keepends=True)[:1]),  # whole lines, too few
         lambda content: b"".join(content.splitlines(keepends=True)[::-1]),
-        lambda content: content + content.splitlines(keepends=True)[-1],
         lambda content: content[:-3],  # within a line
         lambda content: content[:-1],
         lambda content: b"",
-        flipped,
+        lambda content: content.replace(b"b", b"c", 1),
         lambda content: b'{"scan": "a", "boxes": []}\n' * 3,  # as earlier versions wrote them
     ],
 )
@@ -86,16 +80,13 @@ def test_a_damaged_result_is_done_again_and_not_merged(tmp_path: Path, damage: C
         list(folder.lines(shards))
 
 
-def test_a_result_under_the_name_of_another_is_none(tmp_path: Path) -> None:
+def test_a_result_that_is_not_there_or_of_another_shard_is_none(tmp_path: Path) -> None:
     folder, shards = ShardFolder(tmp_path), make_shards(["a", "b", "c", "d"], 2)
     folder.write(shards[0], ["1\n", "2\n"])
     (tmp_path / f"{shards[0].name}.jsonl").rename(tmp_path / f"{shards[1].name}.jsonl")
     assert folder.done(shards) == set()
-
-
-def test_a_result_that_is_not_there_is_named(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match=r"000000003-\w+\.jsonl: .* the same on every machine"):
-        list(ShardFolder(tmp_path).lines([Shard(3, ("a",))]))
+        list(folder.lines([Shard(3, ("a",))]))
 
 
 def test_other_settings_are_refused_and_the_size_stays(tmp_path: Path) -> None:
