@@ -54,7 +54,8 @@ def in_mmdetection3d(state: Mapping[str, Tensor], head: str) -> dict[str, Tensor
         # A block begins with a padding of its own there, and with none here.
         name = re.sub(r"^(backbone\.blocks\.\d)\.(\d+)", lambda m: f"{m[1]}.{int(m[2]) - 1}", name)
         for layers, places in MODULES:
-            name = re.sub(layers, lambda m, places=places: f"{m[1]}.{places[m[2]]}.", name)
+            if layer := re.search(layers, name):
+                name = name.replace(layer[0], f"{layer[1]}.{places[layer[2]]}.")
         if value.ndim > 1 and re.search(r"roi_head\.bbox_head|fusion_layer", name):  # 1x1 convolutions on maps
             value = value.reshape(*value.shape[:2], 1, 1)
         found[name] = value
