@@ -189,15 +189,16 @@ def test_commands_of_the_runtime(fresh: Fresh, tmp_path: Path) -> None:
 
 
 def test_training_and_export(fresh: Fresh, tmp_path: Path) -> None:
+    from asca_pillars.config.pillar import PillarModel
     from tests.export.tiny import SCANS
-    from tests.helpers.scenes import write_dataset
+    from tests.helpers.scenes import SPEC, write_dataset
     from tests.helpers.tiny_run import CONFIG, NETWORK
 
     data, scans = write_dataset(tmp_path / "data", 3), tmp_path / "scans"
     scans.mkdir()
     for number, points in enumerate(SCANS):
         np.save(scans / f"{number}.npy", points)
-    model = dataclasses.replace(CONFIG.model, network=dataclasses.replace(NETWORK, cpa="none"))
+    model = PillarModel(spec=SPEC, network=dataclasses.replace(NETWORK, cpa="none"))
     config = dataclasses.replace(CONFIG, model=model, train=dataclasses.replace(CONFIG.train, epochs=1))
     (tmp_path / "tiny.yaml").write_text(yaml.safe_dump(to_dict(config)))
     commands = asca(
