@@ -1,4 +1,4 @@
-"""The ablation's runs: real commands on a few made-up frames, resumable and repeatable."""
+"""The ablation's runs, real commands on a few made-up frames, resumable and repeatable; and its tables, by hand."""
 
 import dataclasses
 import json
@@ -13,7 +13,8 @@ import yaml
 
 from asca_pillars.ablation import ablation_runs
 from asca_pillars.ablation.ablation_runs import finish_runs, runs
-from asca_pillars.ablation.variants import VARIANTS
+from asca_pillars.ablation.ablation_table import Speed, tables
+from asca_pillars.ablation.variants import PILLARS, VARIANTS
 from asca_pillars.base.errors import AscaError, TrainingError
 from asca_pillars.base.own_files import written_by
 from asca_pillars.base.schema import to_dict
@@ -34,13 +35,15 @@ def config(tmp_path: Path) -> str:
 
 @pytest.mark.usefixtures("in_turn")
 def test_from_training_to_the_table(tmp_path: Path, config: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    data = write_dataset(tmp_path / "data", 14, val_frames=8)
-    out = tmp_path / "out"
-    options: dict[str, Any] = {"override": ["train.learning_rate=0.002"], "seeds": "0", "variants": "baseline,asp_k2"}
+    """One row as the base, and one with a sparse neck on a pooled map, whose zones any range has."""
+    data = write_dataset(tmp_path / "data", 10, val_frames=8)
+    out, variants = tmp_path / "out", "baseline,asp_k3_pooled_cpa_channel_fine"
+    override = ["train.learning_rate=0.002", "model.spec.grid.x_range_m=[4.8, 20.16]"]
+    options: dict[str, Any] = {"override": override, "seeds": "0", "variants": variants}
     ablate(config, data=data, out=out, jobs=2, **options)
     text = (out / "results.md").read_text()
-    assert "6 frames for training, 8 for validation" in text and "2 runs" in text
-    assert sum(line.startswith("| K=2 | - | - | - | - | - |") for line in text.splitlines()) == 2
+    assert "2 frames for training, 8 for validation" in text and "2 runs" in text
+    assert "| K=3 pooled | channel | - | fine | - | - |" in text and "| - | - | - | - | - | - |" in text
     trained = load_config(out / "baseline" / "seed0" / "config.yaml")
     assert (trained.train.learning_rate, pillar_spec(trained).grid.zones) == (2e-3, 1)
     weights = {run.checkpoint: run.checkpoint.stat().st_mtime_ns for run in runs(out, [0], list(VARIANTS.values())[:1])}
@@ -85,14 +88,6 @@ def test_what_would_end_an_ablation_ends_it_before_anything_is_trained(
     with pytest.raises(AscaError, match=message):
         ablate(config, data=data, out=tmp_path / "out", **given)
     assert not (tmp_path / "out").exists()
-
-
-@pytest.mark.usefixtures("in_turn")
-def test_a_sparse_neck_on_a_pooled_map_reaches_the_table(tmp_path: Path, config: str) -> None:
-    data, names = write_dataset(tmp_path / "data", 14, val_frames=8), "asp_k3_pooled_cpa_channel_fine"
-    any_zones = ["model.spec.grid.x_range_m=[4.8, 20.16]"]
-    ablate(config, data=data, out=tmp_path / "out", override=any_zones, seeds="0", variants=names)
-    assert "| K=3 pooled | channel | - | fine | - | - |" in (tmp_path / "out" / "results.md").read_text()
 
 
 def test_as_many_at_a_time_as_asked_for_share_the_cores(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -150,15 +145,13 @@ def test_the_time_of_a_run_is_that_of_all_its_attempts(tmp_path: Path, monkeypat
 
 
 def test_a_failed_run_names_its_log(tmp_path: Path) -> None:
+    todo = runs(tmp_path / "out", [3, 1], [VARIANTS["rs_aug"], VARIANTS["baseline"]])
+    order = [(run.seed, run.variant.name) for run in todo]
+    assert order == [(3, "rs_aug"), (3, "baseline"), (1, "rs_aug"), (1, "baseline")]
     todo = runs(tmp_path / "out", [0], [VARIANTS["baseline"]])
     with pytest.raises(TrainingError, match=r"train\.log: `asca train` of baseline, seed 0 failed: .*nowhere"):
         finish_runs(todo, str(tmp_path / "nowhere.yaml"), tmp_path, "val", jobs=1)  # refused before torch is imported
     assert not todo[0].trained.exists()
-
-
-def test_runs_of_a_seed_come_before_the_next_seed(tmp_path: Path) -> None:
-    order = [(run.seed, run.variant.name) for run in runs(tmp_path, [3, 1], [VARIANTS["rs_aug"], VARIANTS["baseline"]])]
-    assert order == [(3, "rs_aug"), (3, "baseline"), (1, "rs_aug"), (1, "baseline")]
 
 
 def _accuracies(text: str) -> list[str]:
@@ -179,3 +172,53 @@ def test_a_damaged_note_of_the_base_is_one_line_and_can_be_deleted(tmp_path: Pat
     ablate_steps.require_same_base(tmp_path, base)
     with pytest.raises(TrainingError, match="another base"):
         ablate_steps.require_same_base(tmp_path, base | {"data": "other"})
+
+
+def _result(car: float, pedestrian: float, cyclist: float | None) -> dict:
+    def entry(value: float | None) -> dict | None:
+        return None if value is None else {"3d": {"R40": [value + 10, value, value - 1]}}
+
+    results = {"Car": entry(car), "Pedestrian": entry(pedestrian), "Cyclist": entry(cyclist)}
+    far = {"Car": entry(6), "Pedestrian": entry(3), "Cyclist": entry(3)}
+    bands = [{"low_m": 0.0, "high_m": 40.0, "results": results}, {"low_m": 40.0, "high_m": 80.0, "results": far}]
+    return {"results": results, "bands": bands}
+
+
+def test_means_and_spreads_over_the_seeds() -> None:
+    text = tables(PILLARS, {"baseline": [_result(60, 20, 10), _result(64, 26, 12)]}, {})
+    row = next(line for line in text.splitlines() if line.startswith("| - | - | - | - | - | - | 62.00"))
+    # The mean over classes is 30 and 34, so 32 with half their distance.
+    assert row.strip("| ").split(" | ")[6:12] == [
+        "62.00 ± 2.00",
+        "23.00 ± 3.00",
+        "11.00 ± 1.00",
+        "32.00 ± 2.00",
+        "32.00 ± 2.00",
+        "4.00 ± 0.00",
+    ]
+
+
+def test_a_class_that_was_never_detected_counts_as_nothing_found() -> None:
+    text = tables(PILLARS, {"rs_aug": [_result(60, 20, None)]}, {"rs_aug": Speed(12.34, 1.05, (1.0, 1.1), 1234567)})
+    row = next(line for line in text.splitlines() if "1,234,567" in line)
+    assert row.startswith("| - | - | RS-Aug | - | - | - | 60.00 | 20.00 | 0.00 | 26.67 |")
+    assert row.endswith("| 1,234,567 | 12.3 | 1.05 (1.00-1.10) |")
+
+
+def test_easy_moderate_and_hard_stand_in_their_columns() -> None:
+    text = tables(PILLARS, {"asp_k3_cpa_channel": [_result(60, 20, 10)]}, {})
+    row = next(line for line in text.splitlines() if "70.00 | 60.00 | 59.00" in line)
+    assert (
+        row
+        == "| K=3 | channel | - | - | - | - | 70.00 | 60.00 | 59.00 | 30.00 | 20.00 | 19.00 | 20.00 | 10.00 | 9.00 |"
+    )
+
+
+def test_map_neck_matching_and_scores_are_named() -> None:
+    names = ("asp_k3_pooled_cpa_channel_fine", "cpa_channel_lower_ious", "cpa_channel_fine_atss_iou_score")
+    text = tables(PILLARS, {name: [_result(60, 20, 10)] for name in names}, {})
+    assert "| K=3 pooled | channel | - | fine | - | - | 60.00" in text
+    assert "| - | channel | - | - | 0.35 / 0.2 | - | 60.00" in text
+    assert "| - | channel | - | fine | atss | iou | 60.00" in text
+    text = tables(PILLARS, {"asp_k2": [_result(60, 20, 10)]}, {})
+    assert "(K)" in text and "Components" not in text and "Readings" not in text, "tables without results are left out"

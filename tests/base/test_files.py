@@ -13,8 +13,9 @@ from asca_pillars.base.files import atomic_directory, atomic_path, file_inside, 
 from tests.helpers.bundle_folder import EXPORT, names, old_bundle
 
 
-def test_a_file_has_its_name_when_it_is_complete_and_the_old_one_stays_until_then(tmp_path: Path) -> None:
-    target = tmp_path / "new" / "result.json"
+@pytest.mark.parametrize("name", ["result.json", f"{'é' * 120}.json"])  # and one as long as a file system takes
+def test_a_file_has_its_name_when_it_is_complete_and_the_old_one_stays_until_then(tmp_path: Path, name: str) -> None:
+    target = tmp_path / "new" / name
     for old, new in ((None, "{}"), ("{}", "[]")):
         with atomic_path(target) as temporary:
             temporary.write_text(new)
@@ -24,7 +25,7 @@ def test_a_file_has_its_name_when_it_is_complete_and_the_old_one_stays_until_the
     with pytest.raises(RuntimeError, match="halfway"), atomic_path(str(target)) as temporary:
         temporary.write_text("ne")
         raise RuntimeError("halfway")
-    assert target.read_text() == "[]" and names(target.parent) == ["result.json"]
+    assert target.read_text() == "[]" and names(target.parent) == [name]
 
 
 @pytest.mark.skipif(os.name == "nt", reason="POSIX permissions")
@@ -54,6 +55,12 @@ def test_a_folder_has_its_name_when_it_is_complete_and_is_replaced_as_a_whole(tm
         (temporary / "fresh.onnx").write_text("new")
         assert names(target) == ["a.onnx", "bundle.json"]
     assert names(target) == ["fresh.onnx"] and names(target.parent) == ["bundle"]
+    # A foreign file that appears meanwhile is kept; the rule is tested in test_own_files.
+    (target / "bundle.json").write_text('{"file": "fresh.onnx"}')
+    with pytest.raises(OutputError, match="notes"), atomic_directory(target, *EXPORT) as temporary:
+        (temporary / "bundle.json").write_text("new")
+        (target / "notes").write_text("precious")
+    assert names(target) == ["bundle.json", "fresh.onnx", "notes"] and names(target.parent) == ["bundle"]
 
 
 def test_the_old_folder_returns_if_the_new_one_cannot_take_its_place(
@@ -72,17 +79,6 @@ def test_the_old_folder_returns_if_the_new_one_cannot_take_its_place(
     assert names(target) == ["a.onnx", "bundle.json"] and names(tmp_path) == ["bundle"]
 
 
-# --- what is not ours; the rule is tested in test_own_files
-
-
-def test_a_foreign_file_that_appears_meanwhile_is_kept(tmp_path: Path) -> None:
-    target = old_bundle(tmp_path / "bundle")
-    with pytest.raises(OutputError, match="notes"), atomic_directory(target, *EXPORT) as temporary:
-        (temporary / "bundle.json").write_text("new")
-        (target / "notes").write_text("precious")
-    assert names(target) == ["a.onnx", "bundle.json", "notes"] and names(tmp_path) == ["bundle"]
-
-
 def test_one_s_own_folder_is_removed_and_nobody_else_s(tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     for removed in (tmp_path / "absent", old_bundle(tmp_path / "bundle"), tmp_path / "empty"):
@@ -95,21 +91,20 @@ def test_one_s_own_folder_is_removed_and_nobody_else_s(tmp_path: Path) -> None:
     assert names(theirs) == ["a.onnx", "bundle.json", "notes.txt"]
 
 
-def test_what_is_no_file_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(OutputError, match="is a folder"), atomic_path(tmp_path):
-        raise AssertionError("not reached")
-    with pytest.raises(OutputError, match="no regular file"), atomic_path("/dev/null"):
-        raise AssertionError("not reached")
-
-
 @pytest.mark.parametrize("there", [True, False])
-def test_nothing_is_written_through_a_link(tmp_path: Path, there: bool) -> None:
+def test_nothing_is_written_through_a_link_or_over_what_is_no_file(tmp_path: Path, there: bool) -> None:
     if there:
         old_bundle(tmp_path / "theirs")
     (tmp_path / "file").symlink_to("theirs/a.onnx")
     (tmp_path / "folder").symlink_to("theirs")
-    for writing in (atomic_path(tmp_path / "file"), atomic_directory(tmp_path / "folder", *EXPORT)):
-        with pytest.raises(OutputError, match="is a link, and nothing is written through links"), writing:
+    link = "is a link, and nothing is written through links"
+    for writing, message in (
+        (atomic_path(tmp_path / "file"), link),
+        (atomic_directory(tmp_path / "folder", *EXPORT), link),
+        (atomic_path(tmp_path), "is a folder"),
+        (atomic_path("/dev/null"), "no regular file"),
+    ):
+        with pytest.raises(OutputError, match=message), writing:
             raise AssertionError("not reached")
     with pytest.raises(OutputError, match="folder: is a link"):
         remove_directory(tmp_path / "folder", *EXPORT)
@@ -117,28 +112,18 @@ def test_nothing_is_written_through_a_link(tmp_path: Path, there: bool) -> None:
     assert not there or (tmp_path / "theirs" / "a.onnx").read_text() == "old"
 
 
-def test_a_name_as_long_as_a_file_system_takes_is_written(tmp_path: Path) -> None:
-    target = tmp_path / f"{'é' * 120}.json"
-    with atomic_path(target) as temporary:
-        temporary.write_text("{}")
-    assert names(tmp_path) == [target.name]
-
-
 # --- the system's errors, the disk, other threads
 
 
-@pytest.mark.parametrize("code", [errno.ENOSPC, errno.EFBIG])
-def test_a_full_disk_names_the_file(tmp_path: Path, code: int) -> None:
-    for writing in (atomic_path(tmp_path / "a.ckpt"), atomic_directory(tmp_path / "a.ckpt", *EXPORT)):
-        with pytest.raises(OSError, match=r"a\.ckpt") as caught, writing:
-            raise OSError(code, os.strerror(code))
-        assert (caught.value.errno, caught.value.filename) == (code, str(tmp_path / "a.ckpt"))
-    assert names(tmp_path) == []
-
-
-def test_a_folder_that_takes_no_file_is_told_by_the_file_s_name(
+def test_a_full_disk_and_a_folder_that_takes_no_file_are_told_by_the_file_s_name(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    for writing in (atomic_path(tmp_path / "a.ckpt"), atomic_directory(tmp_path / "a.ckpt", *EXPORT)):
+        with pytest.raises(OSError, match=r"a\.ckpt") as full, writing:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        assert (full.value.errno, full.value.filename) == (errno.ENOSPC, str(tmp_path / "a.ckpt"))
+    assert names(tmp_path) == []
+
     def refuse(path: Path, *_: object) -> int:
         raise PermissionError(errno.EACCES, "Permission denied", str(path))
 
@@ -162,11 +147,6 @@ def test_files_and_folders_are_synced_before_they_get_their_names(
     assert synced == [str(path) for path in expected]
 
 
-@pytest.mark.parametrize("text", ["1000", "segment-10_a.b", "0", "a" * 100, "_", "a_b", "x"])
-def test_a_plain_name_stays(text: str) -> None:
-    assert portable_name(text) == text
-
-
 HARMFUL = [
     *("", ".", "..", "../../x", "/etc/passwd", "a/b", "a\\b", "C:x", "a\nb", "a b"),
     *("-x", ".x", "x.", "NUL", "com1.txt"),
@@ -183,7 +163,9 @@ def test_any_text_is_one_plain_name(text: str, tmp_path: Path) -> None:
     assert name.partition(".")[0].casefold() not in ("nul", "com1")
 
 
-def test_different_texts_have_different_names() -> None:
+def test_different_texts_have_different_names_and_plain_ones_stay() -> None:
+    plain = ["1000", "segment-10_a.b", "0", "a" * 100, "_", "a_b", "x"]
+    assert [portable_name(text) for text in plain] == plain
     texts = [*HARMFUL, "_", "a_b", "a?b", "a*b", "x", "ä", "ö"]
     assert len({portable_name(text) for text in texts}) == len(texts)
 

@@ -72,25 +72,20 @@ def placed(tmp_path: Path, name: str) -> Path:
     return path
 
 
-@pytest.mark.parametrize("name", READERS)
-def test_pointers_of_git_lfs_are_named_with_the_remedy(tmp_path: Path, name: str) -> None:
-    placed(tmp_path, name).write_bytes(POINTER)
-    with pytest.raises(AscaError, match="git lfs pull") as refusal:
-        READERS[name](tmp_path / name)
-    assert name in str(refusal.value)
-
-
 @pytest.mark.skipif(sys.platform == "win32", reason="has no such files")
 @pytest.mark.parametrize("name", READERS)
-@pytest.mark.parametrize("kind", ["a named pipe", "a device"])
-def test_what_would_be_read_without_end_is_refused_at_once(tmp_path: Path, name: str, kind: str) -> None:
+@pytest.mark.parametrize("kind", ["a named pipe", "a device", "a pointer of Git LFS"])
+def test_what_would_be_read_without_end_and_what_is_a_pointer_is_refused(tmp_path: Path, name: str, kind: str) -> None:
     path = placed(tmp_path, name)
-    if kind == "a device":
+    if kind == "a pointer of Git LFS":
+        path.write_bytes(POINTER)
+    elif kind == "a device":
         path.symlink_to("/dev/zero")
     else:
         os.mkfifo(path)
-    with pytest.raises(AscaError, match=f"is {kind}"):
+    with pytest.raises(AscaError, match="git lfs pull" if "Git" in kind else f"is {kind}") as refusal:
         READERS[name](path)
+    assert name in str(refusal.value)
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="has no such files")

@@ -48,7 +48,7 @@ def cloud(seed: int, count: int, spread_m: float, grid: PillarGrid, odd: float) 
     return points
 
 
-@settings(max_examples=150)
+@settings(max_examples=60)
 @given(
     st.integers(0, 2**32 - 1),
     st.sampled_from([0, 1, 2, 40, 400]),
@@ -65,7 +65,7 @@ def test_pillars_are_the_same(
     assert_same_bits(pillarize(points, grid, limits), by_numpy(pillarize, points, grid, limits))
 
 
-@pytest.mark.parametrize("grid", [*GRIDS, PillarGrid()], ids=lambda grid: f"{grid.nx}x{grid.ny}")
+@pytest.mark.parametrize("grid", GRIDS, ids=lambda grid: f"{grid.nx}x{grid.ny}")
 def test_points_on_borders_fall_into_the_same_pillars(grid: PillarGrid) -> None:
     values = border_values(grid)
     lines = []
@@ -102,7 +102,7 @@ def boxes_around(seed: int, count: int, spread_m: float) -> tuple[np.ndarray, np
     return boxes, np.round(rng.normal(size=count), 2)
 
 
-@settings(max_examples=150)
+@settings(max_examples=60)
 @given(
     st.integers(0, 2**32 - 1),
     st.sampled_from([0, 1, 2, 30, 200]),
@@ -128,13 +128,10 @@ def test_the_shared_area_is_the_same(seed: int, spread_m: float) -> None:
         assert rotated_nms(boxes, scores, iou * (1 + 1e-9)).tolist() == [0, 1]
 
 
-def test_boxes_that_are_not_finite_clash_with_nothing() -> None:
+def test_boxes_that_are_not_finite_clash_with_nothing_and_nothing_is_compiled_at_use() -> None:
     boxes, scores = np.ones((4, 7), np.float32), np.array([4.0, 3.0, 2.0, 1.0])
     boxes[1, 0], boxes[2, 3] = np.nan, np.nan
     assert rotated_nms(boxes, scores, 0.5).tolist() == [0, 1, 2] == by_numpy(rotated_nms, boxes, scores, 0.5).tolist()
-
-
-def test_nothing_is_compiled_at_use() -> None:
-    module = load_kernels(decode.KERNELS)
+    scratch = np.empty((1, 3)), np.empty((1, 5)), np.empty(1, np.int64)
     with pytest.raises(TypeError, match="No matching definition"):
-        module._nms(np.zeros((1, 7), np.float32), 0.5, 1, np.empty((1, 3)), np.empty((1, 5)), np.empty(1, np.int64))
+        load_kernels(decode.KERNELS)._nms(np.zeros((1, 7), np.float32), 0.5, 1, *scratch)

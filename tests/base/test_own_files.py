@@ -116,35 +116,13 @@ def test_links_below_the_folder_are_refused(tmp_path: Path, link: str, target: s
     (tmp_path / "given").symlink_to(out)
     for folder in (out, tmp_path / "given"):  # which may be a link itself
         require_own(folder, "asca simulate", ABOUT, folders=places)
+    require_no_link(tmp_path / "given", "scans/0000")
     (out / link).rename(tmp_path / "moved")
     (out / link).symlink_to(tmp_path / target)
     with pytest.raises(OutputError, match="is a link, and nothing is written through links"):
         require_own(tmp_path / "given", "asca simulate", ABOUT, folders=places)
-
-
-def test_a_link_is_named_at_its_step(tmp_path: Path) -> None:
-    (tmp_path / "a").mkdir()
-    (tmp_path / "a" / "b").symlink_to(tmp_path)
-    require_no_link(tmp_path, "a")
-    require_no_link(tmp_path / "a" / "b", ".")
-    require_no_link(tmp_path / "a" / "b", "c/d")
-    with pytest.raises(OutputError, match=r"a/b: is a link"):
-        require_no_link(tmp_path, "a/b/c")
-
-
-# --- folders that are replaced as a whole
-
-
-def test_a_folder_of_other_files_is_not_replaced(tmp_path: Path) -> None:
-    target = tmp_path / "thesis"
-    target.mkdir()
-    for empty in (target, tmp_path / "absent"):
-        require_replaceable(empty, *EXPORT)
-    (target / "thesis.txt").write_text("precious")
-    with pytest.raises(OutputError, match=r"thesis.txt and no bundle.json"):
-        require_replaceable(target, *EXPORT)
-    with pytest.raises(OutputError, match="is a file where a folder"):
-        require_replaceable(target / "thesis.txt", *EXPORT)
+    with pytest.raises(OutputError, match=f"{link}: is a link"):  # named at its step
+        require_no_link(out, f"{link}/c")
 
 
 def _add_a_folder(path: Path) -> None:
@@ -177,3 +155,15 @@ def test_an_earlier_output_with_something_foreign_is_not_replaced(
     with pytest.raises(OutputError, match=rf"{name}: (`asca export` did not write it|is a link)"):
         require_replaceable(target, *EXPORT)
     assert names(target) == before
+
+
+def test_a_folder_of_other_files_is_not_replaced(tmp_path: Path) -> None:
+    for empty in (tmp_path, tmp_path / "absent"):
+        require_replaceable(empty, *EXPORT)
+    (tmp_path / "thesis.txt").write_text("precious")
+    for target, message in (
+        (tmp_path, "thesis.txt and no bundle.json"),
+        (tmp_path / "thesis.txt", "is a file where a"),
+    ):
+        with pytest.raises(OutputError, match=message):
+            require_replaceable(target, *EXPORT)

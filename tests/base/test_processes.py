@@ -7,7 +7,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from multiprocessing.context import SpawnProcess
 from pathlib import Path
 
@@ -21,6 +21,8 @@ from asca_pillars.base.processes import map_in_processes
 def square(number: int) -> tuple[int, int, int]:
     if number < 0:
         raise DatasetError(f"{number}: is negative")
+    if number == 1000:
+        raise TwoArgumentsError("one", "second")
     return number * number, os.getpid(), cv2.getNumThreads()
 
 
@@ -44,18 +46,21 @@ def test_nothing_is_started_for_one_process(count: int, workers: int) -> None:
     assert {process for _, process, _ in found} <= {os.getpid()}
 
 
+class TwoArgumentsError(Exception):
+    """Cannot be unpickled, as the errors of several libraries."""
+
+    def __init__(self, first: str, second: str) -> None:
+        super().__init__(first + second)
+
+
 @pytest.mark.parametrize("workers", [1, 2])
 def test_the_error_of_a_job_is_raised(workers: int) -> None:
-    results = map_in_processes(square, [3, -1, 2], workers, "Squares", at_once=1, progress=False)
-    assert next(results)[0] == 9
-    with pytest.raises(DatasetError, match="-1: is negative"):
-        next(results)
-
-
-def killed(number: int) -> int:
-    if number == 5:
-        os.kill(os.getpid(), signal.SIGKILL)
-    return number
+    odd = TypeError if workers > 1 else TwoArgumentsError
+    for number, error, message in ((-1, DatasetError, "-1: is negative"), (1000, odd, "second")):
+        results = map_in_processes(square, [3, number, 2], workers, "Squares", at_once=1, progress=False)
+        assert next(results)[0] == 9
+        with pytest.raises(error, match=message):
+            next(results)
 
 
 def unhurried(number: int) -> int:
@@ -64,41 +69,18 @@ def unhurried(number: int) -> int:
 
 
 def test_a_process_that_is_killed_while_it_waits_ends_the_work() -> None:
-    """In a pool of the standard library it takes the lock of the common queue with it."""
+    """In a pool of the standard library it takes the lock of the common queue with it, and the pool waits forever.
+
+    The kernel kills where memory runs out.
+    """
     results = map_in_processes(unhurried, range(1000), 2, "Unhurried", at_once=1, progress=False)
     process = next(results)
     os.kill(process, signal.SIGKILL)
     deadline = time.monotonic() + 30
     while process in {child.pid for child in multiprocessing.active_children()} and time.monotonic() < deadline:
         time.sleep(0.01)
-    with pytest.raises(WorkerError, match="were killed"):
+    with pytest.raises(WorkerError, match=r"1 of 2 worker processes were killed, .*; use fewer workers"):
         list(results)
-
-
-class TwoArgumentsError(Exception):
-    """Cannot be unpickled, as the errors of several libraries."""
-
-    def __init__(self, first: str, second: str) -> None:
-        super().__init__(first + second)
-
-
-def fails_oddly(number: int) -> int:
-    if number == 5:
-        raise TwoArgumentsError("one", "two")
-    return number
-
-
-@pytest.mark.parametrize(
-    ("job", "error", "message"),
-    [
-        # The kernel kills where memory runs out; the pool of the standard library then waits forever.
-        (killed, WorkerError, r"1 of 2 worker processes were killed, .*; use fewer workers"),
-        (fails_oddly, TypeError, "second"),
-    ],
-)
-def test_what_befalls_a_process_ends_the_work(job: Callable[[int], int], error: type[Exception], message: str) -> None:
-    with pytest.raises(error, match=message):
-        list(map_in_processes(job, range(40), 2, "Jobs", progress=False))
 
 
 def test_a_process_that_cannot_be_started_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:

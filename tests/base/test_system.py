@@ -72,20 +72,11 @@ def test_quota_of_cgroups(tmp_path: Path, case: str) -> None:
 @pytest.mark.parametrize(("quota", "threads"), [(math.inf, 4), (2.9, 2), (0.5, 1), (64.0, 4)])
 def test_default_threads(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, quota: float, threads: int) -> None:
     write(tmp_path / "cpuinfo", HYPERTHREADED)
-    monkeypatch.setattr(system, "PROC", tmp_path)
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(8)), raising=False)
     monkeypatch.setattr(system, "cpu_quota", lambda: quota)
-    assert system.default_threads() == threads
-
-
-def test_default_threads_elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert system.cpu_model()
+    monkeypatch.setattr(system, "PROC", tmp_path)
+    assert (system.default_threads(), system.cpu_model()) == (threads, "Example 9000")
     monkeypatch.setattr(system, "PROC", tmp_path / "none")
     monkeypatch.setattr(os, "cpu_count", lambda: 6)
-    assert system.default_threads() == 6
-
-
-def test_cpu_model(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert system.cpu_model()
-    write(tmp_path / "cpuinfo", HYPERTHREADED)
-    monkeypatch.setattr(system, "PROC", tmp_path)
-    assert system.cpu_model() == "Example 9000"
+    assert system.default_threads() == 6, "elsewhere"

@@ -17,9 +17,9 @@ import onnxruntime
 import pytest
 import yaml
 
-from asca_deploy import sample_scan_path
+from asca_deploy import onnx_runtime
 from asca_pillars.base.schema import to_dict
-from asca_pillars.base.telemetry import disable_telemetry, onnxruntime_may_report
+from asca_pillars.base.telemetry import onnxruntime_may_report
 from tests.helpers import socket_filter
 from tests.helpers.bundles import DENSE_INT8
 from tests.helpers.package_imports import PACKAGES, ROOT, imports
@@ -62,48 +62,29 @@ def test_what_the_user_has_set_stays(
     monkeypatch.delenv("ORT_DISABLE_TELEMETRY", raising=False)
     if stated is not None:
         monkeypatch.setenv("ORT_DISABLE_TELEMETRY", stated)
-    disable_telemetry()
+    calls: list[int] = []
+    monkeypatch.setattr(onnxruntime, "disable_telemetry_events", lambda: calls.append(1))
+    importlib.reload(onnx_runtime)  # as where the caller has imported onnxruntime before
     assert os.environ["ORT_DISABLE_TELEMETRY"] == expected and os.environ["RAY_USAGE_STATS_ENABLED"] == "1"
-    assert onnxruntime_may_report() == may_report
+    assert onnxruntime_may_report() == may_report and len(calls) == (not may_report)
+    if stated is None:
+        monkeypatch.delenv("ORT_DISABLE_TELEMETRY")
+    monkeypatch.delitem(sys.modules, "onnxruntime")
+    monkeypatch.setattr(sys, "meta_path", [seen := Watch(), *sys.meta_path])
+    with pytest.raises(ModuleNotFoundError):
+        importlib.reload(onnx_runtime)
+    assert seen.stated == expected, "before onnxruntime is imported"
 
-
-FIRST_IMPORT = """
-import importlib, os, sys
 
 class Watch:
-    def find_spec(self, name, path=None, target=None):
+    """What the environment says where onnxruntime is imported, which is as if it were not there."""
+
+    stated: str | None = None
+
+    def find_spec(self, name: str, *_: object) -> None:
         if name == "onnxruntime":
-            print("seen", os.environ["ORT_DISABLE_TELEMETRY"], flush=True)
-            os._exit(0)  # what it imports after that takes seconds
-
-sys.meta_path.insert(0, Watch())
-importlib.import_module(sys.argv[1])
-"""
-
-
-@pytest.mark.parametrize("module", ["asca_deploy", "asca_export.rounded_backbones", "asca_pillars.training.loop"])
-def test_it_is_off_before_anybody_imports_onnxruntime(module: str) -> None:
-    result = run([sys.executable, "-c", FIRST_IMPORT, module])
-    assert result.stdout == "seen 1\n", result.stderr
-
-
-IMPORTED_BEFORE = """
-import onnxruntime
-calls = []
-onnxruntime.disable_telemetry_events = lambda: calls.append(1)
-import asca_deploy
-print(len(calls))
-"""
-
-
-@pytest.mark.parametrize(("stated", "calls"), [(None, "1"), ("0", "0")])
-def test_what_can_be_done_where_the_caller_has_imported_it_before(
-    tmp_path: Path, stated: str | None, calls: str
-) -> None:
-    environment = {"HOME": str(tmp_path)} | ({} if stated is None else {"ORT_DISABLE_TELEMETRY": stated})
-    result = run([sys.executable, "-c", IMPORTED_BEFORE], environment)
-    assert result.returncode == 0, result.stderr
-    assert result.stdout.strip() == calls
+            self.stated = os.environ.get("ORT_DISABLE_TELEMETRY")
+            raise ModuleNotFoundError(name)
 
 
 def run(
@@ -151,9 +132,20 @@ def fresh(tmp_path: Path, _filtered: None) -> Fresh:
 
 
 COMMANDS = """
-import json, sys
+import importlib, json, os, sys, time
+
+class Watch:
+    def find_spec(self, name, path=None, target=None):
+        if name == "onnxruntime":
+            assert os.environ.get("ORT_DISABLE_TELEMETRY") == "1", "it is imported with its telemetry on"
+            seen.append(time.monotonic())
+
+seen = []
+sys.meta_path.insert(0, Watch())
+_, first, commands, wait_s = sys.argv
+importlib.import_module(first)
 from asca_pillars.cli.main import main
-for command in json.loads(sys.argv[1]):
+for command in json.loads(commands):
     print(*command, flush=True)
     sys.argv = ["asca", *command]
     try:
@@ -161,61 +153,56 @@ for command in json.loads(sys.argv[1]):
     except SystemExit as end:
         if end.code:
             raise
-"""
-
-
-def asca(*commands: tuple[object, ...]) -> tuple[str, ...]:
-    """A process that runs `asca COMMAND` for one command after the other: to start costs more than they do."""
-    return sys.executable, "-c", COMMANDS, json.dumps([list(map(str, command)) for command in commands])
-
-
-DETECT = """
-import sys, time
-from asca_pillars import Detector, read_scan
-print(len(Detector("fast")(read_scan(sys.argv[1]).points)))
-time.sleep(float(sys.argv[2]))
+time.sleep(max(0, seen[0] + float(wait_s) - time.monotonic()))
 """
 REPORT_S = 12.0
 """onnxruntime 1.32 opens its first socket nine seconds after it was imported."""
 
 
-def test_reports_would_be_seen_where_a_process_detects_for_long(fresh: Fresh, tmp_path: Path) -> None:
+def asca(first: str, *commands: tuple[object, ...], wait_s: float = 0) -> tuple[str, ...]:
+    """A process that imports the module `first`, runs `asca COMMAND` for one after the other and waits for reports.
+
+    One process, because to start costs more than the commands do.
+    """
+    listed = json.dumps([list(map(str, command)) for command in commands])
+    return sys.executable, "-c", COMMANDS, first, listed, str(wait_s)
+
+
+def test_commands_of_the_runtime(fresh: Fresh, tmp_path: Path) -> None:
+    """Reports would be seen, where a process has imported onnxruntime for long."""
+    commands = ["detect -o out/detect", "bench --rounds 1 --json out/bench.json", "doctor"]
+    if importlib.util.find_spec("openvino") is not None:
+        commands.append(f"detect -o out/openvino -b {DENSE_INT8} --provider openvino")
+    (fresh.work / "out").mkdir()
     reporting = Fresh(tmp_path / "reporting")
-    detect = (sys.executable, "-c", DETECT, sample_scan_path())
     with ThreadPoolExecutor() as pool:
-        would = pool.submit(reporting.run, *detect, 2 * REPORT_S, ORT_DISABLE_TELEMETRY="0")
-        result = fresh.run(*detect, REPORT_S)
-        assert result.returncode == 0, result.stderr
-        assert int(result.stdout) > 3
-        assert list(fresh.files()) == []
+        sleeps = f"import asca_deploy, time; time.sleep({2 * REPORT_S})"
+        would = pool.submit(reporting.run, sys.executable, "-c", sleeps, ORT_DISABLE_TELEMETRY="0")
+        result = fresh.run(*asca("asca_deploy", *(tuple(command.split()) for command in commands), wait_s=REPORT_S))
+        assert result.returncode == 0, f"{result.stdout}{result.stderr}"
+        assert json.loads((fresh.work / "out/bench.json").read_text())
+        assert [path for path in fresh.files() if not path.as_posix().startswith("work/out/")] == []
         if not onnxruntime.__version__.startswith("1.32."):
             pytest.skip("the other half is about what onnxruntime 1.32 does")
         assert would.result().returncode == -signal.SIGSYS
     assert any(path.name == "deviceid" for path in reporting.files())
 
 
-def test_commands_of_the_runtime(fresh: Fresh) -> None:
-    commands = ["detect -o out/detect", "bench --rounds 1 --json out/bench.json", "doctor"]
-    if importlib.util.find_spec("openvino") is not None:
-        commands.append(f"detect -o out/openvino -b {DENSE_INT8} --provider openvino")
-    (fresh.work / "out").mkdir()
-    result = fresh.run(*asca(*(tuple(command.split()) for command in commands)))
-    assert result.returncode == 0, f"{result.stdout}{result.stderr}"
-    assert [path for path in fresh.files() if not path.as_posix().startswith("work/out/")] == []
-
-
 def test_training_and_export(fresh: Fresh, tmp_path: Path) -> None:
+    from asca_pillars.config.pillar import PillarModel
     from tests.export.tiny import SCANS
-    from tests.helpers.scenes import write_dataset
-    from tests.helpers.tiny_run import CONFIG
+    from tests.helpers.scenes import SPEC, write_dataset
+    from tests.helpers.tiny_run import CONFIG, NETWORK
 
     data, scans = write_dataset(tmp_path / "data", 3), tmp_path / "scans"
     scans.mkdir()
     for number, points in enumerate(SCANS):
         np.save(scans / f"{number}.npy", points)
-    config = dataclasses.replace(CONFIG, train=dataclasses.replace(CONFIG.train, epochs=1))
+    model = PillarModel(spec=SPEC, network=dataclasses.replace(NETWORK, cpa="none"))
+    config = dataclasses.replace(CONFIG, model=model, train=dataclasses.replace(CONFIG.train, epochs=1))
     (tmp_path / "tiny.yaml").write_text(yaml.safe_dump(to_dict(config)))
     commands = asca(
+        "asca_pillars.training.loop",
         ("train", tmp_path / "tiny.yaml", "--data", data, "--out", "run"),
         ("export", "run/checkpoints/last.ckpt", "--scans", scans, "-o", "bundle"),
     )

@@ -28,9 +28,4 @@ def test_scans_one_by_one_are_what_a_batch_of_them_gives() -> None:
         assert len(found) == len(expected) > 0 and found.names == expected.names
         np.testing.assert_allclose(found.boxes, expected.boxes, atol=1e-4)
         np.testing.assert_allclose(found.scores, expected.scores, atol=1e-5)
-
-
-def test_a_scan_without_points_is_a_scan() -> None:
-    assert isinstance(CONFIG.model, PillarModel)
-    network = build_pillar_detector(CONFIG.model).eval()
     assert len(ScanDetector(network, CONFIG.model.spec)(np.empty((0, 4), np.float32))) == 0

@@ -21,7 +21,7 @@ CASES = (
 
 
 def make_tables(
-    shape: Shape, convolution: Convolution, share: float = 0.2
+    shape: Shape, convolution: Convolution, share: float
 ) -> tuple[CellMap, CellMap, tuple[torch.Tensor, torch.Tensor]]:
     """Input and output cells, and the two tables; cells of submanifold convolutions stay."""
     source, target = CellMap(shape), CellMap(convolution.output_shape(shape))
@@ -36,13 +36,13 @@ def make_tables(
 
 
 @pytest.mark.parametrize(("shape", "convolution"), CASES)
-@pytest.mark.parametrize("chunk", [64, 1 << 20])
+@pytest.mark.parametrize(("chunk", "share"), [(64, 0.2), (1 << 20, 0.2), (64, 0.0)])
 def test_equals_the_dense_convolution(
-    shape: Shape, convolution: Convolution, chunk: int, monkeypatch: pytest.MonkeyPatch
+    shape: Shape, convolution: Convolution, chunk: int, share: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(module, "CHUNK_VALUES", chunk)
     torch.manual_seed(0)
-    source, target, (table, back) = make_tables(shape, convolution)
+    source, target, (table, back) = make_tables(shape, convolution, share)
     features = torch.randn(len(source), 3, dtype=torch.float64, requires_grad=True)
     weight = torch.randn(5, 3, *convolution.kernel, dtype=torch.float64, requires_grad=True)
     z, y, x = shape
@@ -60,15 +60,6 @@ def test_equals_the_dense_convolution(
         strict=True,
     ):
         torch.testing.assert_close(one, other)
-
-
-def test_nothing_active_gives_nothing() -> None:
-    _, _, (table, back) = make_tables((1, 8, 10), map_convolution(3, stride=2, padding=1), share=0)
-    weight = torch.randn(3, 2, 1, 3, 3, requires_grad=True)
-    found = rulebook_conv(torch.empty(0, 2), weight, table, back)
-    assert found.shape == (0, 3)
-    found.sum().backward()
-    assert weight.grad is not None and not weight.grad.any()
 
 
 def test_autocast_computes_in_bfloat16_and_adds_up_in_float32() -> None:
@@ -96,7 +87,7 @@ def test_the_same_bits_in_every_run() -> None:
     try:
         torch.set_num_threads(4)
         results = []
-        for _ in range(20):
+        for _ in range(8):
             found = rulebook_conv(features, weight, table, back)
             results.append((found.detach(), *torch.autograd.grad(found.square().sum(), (features, weight))))
     finally:
@@ -110,10 +101,7 @@ def test_rounds_up_by_a_sixteenth_at_most(rows: int) -> None:
     rounded = rounded_rows(rows)
     assert rows <= rounded <= rows + rows // 16
     assert rounded_rows(rounded) == rounded
-
-
-def test_few_numbers_of_rows_remain() -> None:
-    assert len({rounded_rows(rows) for rows in range(4096, 8192)}) <= 17
+    assert len({rounded_rows(rows) for rows in range(4096, 8192, 16)}) <= 17, "few numbers remain"
 
 
 @pytest.mark.parametrize("rows", [0, 1, 33, 1001])

@@ -66,12 +66,9 @@ def test_a_second_stage(tmp_path: Path) -> None:
 def test_pv_rcnn(changes: dict[str, Any]) -> None:
     detector = tiny_detector(**changes)
     learns_and_detects(detector, batch(detector, frame(0), frame(1)), detector.model.spec)
-
-
-def test_a_step_with_nothing_to_learn_from() -> None:
-    detector = tiny_detector()
-    empty = dataclasses.replace(frame(0), points=np.empty((0, 4), np.float32))
-    learns_and_detects(detector, batch(detector, empty, empty), detector.model.spec)
+    if not changes:
+        empty = dataclasses.replace(frame(0), points=np.empty((0, 4), np.float32))
+        learns_and_detects(detector, batch(detector, empty, empty), detector.model.spec)
 
 
 def test_single_scans() -> None:
@@ -87,11 +84,8 @@ def test_single_scans() -> None:
 
 def test_what_stays_on_the_cpu_is_refused() -> None:
     with SecondDevice():
-        there, here = torch.ones(3).to("cuda"), torch.ones(3)
-        assert there.is_cuda and there.device.type == "cuda" and torch.zeros(2, device=there.device).is_cuda
-        assert not there.cpu().is_cuda and not here.is_cuda
-        assert (2 * there + there[torch.tensor([0, 1, 1])] + torch.tensor(1.0)).is_cuda
-        for refused in (lambda: there + here, lambda: there.index_select(0, torch.tensor([0])), there.numpy):
+        there = torch.ones(3).to("cuda")
+        for refused in (lambda: there + torch.ones(3), lambda: there.index_select(0, torch.tensor([0])), there.numpy):
             with pytest.raises(RuntimeError, match="on the"):
                 refused()
         detector = tiny_detector()

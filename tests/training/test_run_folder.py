@@ -61,6 +61,9 @@ def test_a_run_goes_on_with_its_own_frames_processes_and_first_weights_alone(tmp
     (tmp_path / "frames.json").write_text("{")
     with pytest.raises(ConfigError, match=r"frames\.json: not valid YAML"):
         claim_run_folder(tmp_path, CONFIG, SEEN)
+    (tmp_path / "expected_input.yaml").write_text("points_per_scan: [")
+    with pytest.raises(ConfigError, match=r"expected_input\.yaml: not valid YAML: "):
+        measure_input(tmp_path, cast(Any, None), keep=True)  # no frame is asked where something was kept
     (tmp_path / "frames.json").unlink()  # an older version wrote none
     claim_run_folder(tmp_path, CONFIG, SEEN._replace(initial_sha256=""))
     with pytest.raises(TrainingError, match=r"was started from random weights; leave --init out"):
@@ -88,34 +91,26 @@ def test_a_run_on_other_data_is_refused_before_it_begins(tmp_path: Path) -> None
 
 def test_a_run_may_be_made_longer_where_its_schedule_allows(tmp_path: Path) -> None:
     def of(**recipe: object) -> Config:
-        return dataclasses.replace(CONFIG, train=TrainConfig(**recipe))  # type: ignore[arg-type]
+        return dataclasses.replace(CONFIG, train=TrainConfig(batch_size=1, **recipe))  # type: ignore[arg-type]
 
-    step, cycle = tmp_path / "step", tmp_path / "cycle"
-    claim_run_folder(step, of(epochs=2, schedule="step"), SEEN)
-    claim_run_folder(cycle, of(epochs=2, schedule="one_cycle"), SEEN)
-    learn(step)
-    learn(cycle)
-    claim_run_folder(step, of(epochs=5, schedule="step"), SEEN)
+    stable = {"schedule": "warmup_stable_decay", "cooldown": 0.25}
+    seen = TrainingInputs(10, "ab", 1)  # ten steps an epoch: of four stable epochs the last ten steps fall
+    step, cycle, falling = (tmp_path / name for name in ("step", "cycle", "falling"))
+    claim_run_folder(step, of(epochs=2, schedule="step"), seen)
+    claim_run_folder(cycle, of(epochs=2, schedule="one_cycle"), seen)
+    claim_run_folder(falling, of(epochs=4, **stable), seen)
+    for folder in (step, cycle, falling):
+        learn(folder)
+    claim_run_folder(step, of(epochs=5, schedule="step"), seen)
     for folder, config, message in (
         (step, of(epochs=4, schedule="step"), r"train\.epochs = 5, now train\.epochs = 4; choose another"),
         (step, of(epochs=9, schedule="step", seed=1), r"config\.yaml: .* train\.seed = 0, now train\.seed = 1"),
         (cycle, of(epochs=3, schedule="one_cycle"), r"one_cycle schedule is planned .*--init .*last\.ckpt"),
+        (falling, of(epochs=8, **stable), r"fallen since step 30 of 40: start .*--init .*last\.ckpt"),
     ):
         with pytest.raises(TrainingError, match=message):
-            claim_run_folder(folder, config, SEEN)
-
-
-def test_a_stable_run_may_be_made_longer_until_its_rate_falls(tmp_path: Path) -> None:
-    def of(epochs: int) -> Config:
-        recipe = TrainConfig(epochs=epochs, batch_size=1, schedule="warmup_stable_decay", cooldown=0.25)
-        return dataclasses.replace(CONFIG, train=recipe)
-
-    seen = TrainingInputs(10, "ab", 1)  # ten steps an epoch: of four epochs the last ten steps fall
-    claim_run_folder(tmp_path, of(4), seen)
-    learn(tmp_path)
-    with pytest.raises(TrainingError, match=r"fallen since step 30 of 40: start .*--init .*last\.ckpt"):
-        claim_run_folder(tmp_path, of(8), seen, steps=31)
-    claim_run_folder(tmp_path, of(8), seen, steps=30)
+            claim_run_folder(folder, config, seen, steps=31)
+    claim_run_folder(falling, of(epochs=8, **stable), seen, steps=30)
 
 
 def test_a_run_that_learnt_nothing_gives_way(tmp_path: Path) -> None:
@@ -158,19 +153,15 @@ def test_a_folder_in_which_another_process_trains_is_left_to_it(tmp_path: Path) 
         assert yaml.safe_load((tmp_path / "run" / "config.yaml").read_text()) == to_dict(CONFIG)
 
 
-@pytest.mark.parametrize("mistake", [{"init": "nosuch.ckpt"}, {"devices": "many"}])
-def test_a_mistyped_start_is_refused_before_anything_is_done(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, mistake: dict[str, str]
-) -> None:
-    data = write_dataset(tmp_path / "data", 3)
-    monkeypatch.setattr(loop, "DetectionData", lambda *_: pytest.fail("the data were prepared"))
-    with pytest.raises(TrainingError, match="|".join(mistake.values())):
-        train(CONFIG, data, tmp_path / "run", **mistake)  # type: ignore[arg-type]
-    assert not (tmp_path / "run").exists()
-
-
-def test_a_training_that_cannot_begin_leaves_no_folder(tmp_path: Path) -> None:
+def test_a_training_that_cannot_begin_leaves_no_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     data = write_dataset(tmp_path / "data", 3, val_frames=1)
+    with monkeypatch.context() as patch:  # mistyped, and refused before anything is done
+        patch.setattr(loop, "DetectionData", lambda *_: pytest.fail("the data were prepared"))
+        mistakes: Any = {"init": "nosuch.ckpt"}, {"devices": "many"}
+        for mistake in mistakes:
+            with pytest.raises(TrainingError, match="|".join(mistake.values())):
+                train(CONFIG, data, tmp_path / "run", **mistake)
+            assert not (tmp_path / "run").exists()
     KittiSplit(data, "val").calib_path("000002").unlink()
     for root, message in (
         (data, r"calib.000002\.txt: not there \(1 of 2 calibration and label files"),
@@ -181,18 +172,9 @@ def test_a_training_that_cannot_begin_leaves_no_folder(tmp_path: Path) -> None:
         assert not (tmp_path / "run").exists()
 
 
-def test_a_damaged_measurement_of_the_input_is_one_line(tmp_path: Path) -> None:
-    (tmp_path / "expected_input.yaml").write_text("points_per_scan: [")
-    with pytest.raises(ConfigError, match=r"expected_input\.yaml: not valid YAML: "):
-        measure_input(tmp_path, cast(Any, None), keep=True)  # no frame is asked where something was kept
-
-
 @pytest.mark.parametrize(
     ("content", "given"),
-    [
-        *((content, "exp1/config.yaml") for content in USERS),
-        *(("short", given) for given in ("exp1/../exp1/config.yaml", "link.yaml", "other.yaml")),
-    ],
+    [("whole", "exp1/../exp1/config.yaml"), ("commented", "link.yaml"), ("short", "other.yaml")],
 )
 def test_a_configuration_of_the_user_is_not_replaced(tmp_path: Path, content: str, given: str) -> None:
     path = tmp_path / "exp1" / "config.yaml"
@@ -219,25 +201,23 @@ def test_nor_is_one_that_is_put_into_the_folder_of_a_run(tmp_path: Path) -> None
         claim_run_folder(tmp_path, CONFIG, SEEN)  # from Python
 
 
-@pytest.mark.parametrize("name", ["checkpoints", "tensorboard", "config.yaml"])
-def test_nothing_is_trained_through_links(tmp_path: Path, name: str) -> None:
-    run, elsewhere = tmp_path / "run", tmp_path / "elsewhere"
+def test_nothing_is_trained_through_links_or_over_the_weights_to_start_from(tmp_path: Path) -> None:
+    run = tmp_path / "run"
     claim_run_folder(run, CONFIG, SEEN)
-    elsewhere.mkdir()
-    (run / name).unlink(missing_ok=True)
-    (run / name).symlink_to(elsewhere)
-    with pytest.raises(OutputError, match=f"{name}: is a link"):
-        require_own_run(run)
-
-
-def test_weights_to_start_from_are_not_those_that_the_run_replaces(tmp_path: Path) -> None:
-    claim_run_folder(tmp_path / "run", CONFIG, SEEN)
-    learn(tmp_path / "run")
-    last = tmp_path / "run" / "checkpoints" / "last.ckpt"
-    require_own_run(tmp_path / "run", "asca_sim")
+    learn(run)
+    last = run / "checkpoints" / "last.ckpt"
+    require_own_run(run, "asca_sim")
     require_own_run(tmp_path / "other", last)
     with pytest.raises(OutputError, match=r"would replace .*last\.ckpt, which is read"):
-        require_own_run(tmp_path / "run", last)
+        require_own_run(run, last)
+    (run / "tensorboard").mkdir()
+    for name in ("checkpoints", "tensorboard", "config.yaml"):
+        (run / name).rename(tmp_path / name)
+        (run / name).symlink_to(tmp_path / name)
+        with pytest.raises(OutputError, match=f"{name}: is a link"):
+            require_own_run(run)
+        (run / name).unlink()
+        (tmp_path / name).rename(run / name)
 
 
 def test_the_output_of_a_shell_stays_beside_a_run(tmp_path: Path) -> None:

@@ -28,56 +28,41 @@ def write_foreign(path: Path, state: dict[str, Tensor]) -> Path:
     return path
 
 
-def map_layers(
-    channels: int, widths: Sequence[int], convs: Sequence[int], strides: Sequence[int], up: int, *, pad_first: bool
-) -> tuple[nn.ModuleList, nn.ModuleList]:
-    """Blocks and upsamplings of a neck; with `pad_first` a block begins with a padding of zeros, of its own."""
-    blocks, deblocks, total = nn.ModuleList(), nn.ModuleList(), 1
-    for width, count, stride in zip(widths, convs, strides, strict=True):
-        total *= stride
-        layers: list[nn.Module] = [nn.ZeroPad2d(1)] if pad_first else []
-        layers.append(nn.Conv2d(channels, width, 3, stride, padding=0 if pad_first else 1, bias=False))
-        for number in range(count + 1):
-            layers += [nn.BatchNorm2d(width, eps=1e-3), nn.ReLU()]
-            layers += [nn.Conv2d(width, width, 3, padding=1, bias=False)] if number < count else []
-        blocks.append(nn.Sequential(*layers))
-        step = total // strides[0]
-        upsampling = nn.ConvTranspose2d(width, up, step, step, bias=False)
-        deblocks.append(nn.Sequential(upsampling, nn.BatchNorm2d(up, eps=1e-3), nn.ReLU()))
-        channels = width
-    return blocks, deblocks
-
-
-def map_features(blocks: nn.ModuleList, deblocks: nn.ModuleList, features: Tensor) -> Tensor:
-    maps = []
-    for block, deblock in zip(blocks, deblocks, strict=True):
-        features = block(features)
-        maps.append(deblock(features))
-    return torch.cat(maps, dim=1)
-
-
 class MapBackbone(nn.Module):
-    """BaseBEVBackbone."""
+    """BaseBEVBackbone; each block begins with a padding of zeros."""
 
     def __init__(
         self, channels: int, widths: Sequence[int], convs: Sequence[int], strides: Sequence[int], up: int
     ) -> None:
         super().__init__()
-        self.blocks, self.deblocks = map_layers(channels, widths, convs, strides, up, pad_first=True)
+        self.blocks, self.deblocks, total = nn.ModuleList(), nn.ModuleList(), 1
+        for width, count, stride in zip(widths, convs, strides, strict=True):
+            total *= stride
+            layers: list[nn.Module] = [nn.ZeroPad2d(1), nn.Conv2d(channels, width, 3, stride, bias=False)]
+            for number in range(count + 1):
+                layers += [nn.BatchNorm2d(width, eps=1e-3), nn.ReLU()]
+                layers += [nn.Conv2d(width, width, 3, padding=1, bias=False)] if number < count else []
+            self.blocks.append(nn.Sequential(*layers))
+            step = total // strides[0]
+            upsampling = nn.ConvTranspose2d(width, up, step, step, bias=False)
+            self.deblocks.append(nn.Sequential(upsampling, nn.BatchNorm2d(up, eps=1e-3), nn.ReLU()))
+            channels = width
 
     def forward(self, features: Tensor) -> Tensor:
-        return map_features(self.blocks, self.deblocks, features)
+        maps = []
+        for block, deblock in zip(self.blocks, self.deblocks, strict=True):
+            features = block(features)
+            maps.append(deblock(features))
+        return torch.cat(maps, dim=1)
 
 
 class AnchorHead(nn.Module):
     """AnchorHeadSingle: every anchor has a score for every class."""
 
-    BOXES = "conv_box"
-
     def __init__(self, channels: int, anchors: int, classes: int) -> None:
         super().__init__()
         self.conv_cls = nn.Conv2d(channels, anchors * classes, 1)
-        setattr(self, self.BOXES, nn.Conv2d(channels, anchors * 7, 1))
+        self.conv_box = nn.Conv2d(channels, anchors * 7, 1)
         self.conv_dir_cls = nn.Conv2d(channels, anchors * 2, 1)
 
     def forward(self, features: Tensor) -> list[Tensor]:

@@ -1,20 +1,14 @@
-"""Networks with the names, shapes and equations that mmdetection3d 1.x publishes, in plain dense PyTorch."""
+"""OpenPCDet's networks, which mmdetection3d 1.x has with the same equations, under its names and in its shapes."""
 
-from collections.abc import Sequence
+import re
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from tests.models.openpcdet.foreign_networks import (
-    AnchorHead,
-    PillarLayer,
-    SparseLayer,
-    foreground,
-    map_features,
-    map_layers,
-)
+from tests.models.openpcdet import foreign_networks
 
 
 def write_mmdetection3d(path: Path, state: dict[str, Tensor], **meta: Any) -> Path:
@@ -24,121 +18,59 @@ def write_mmdetection3d(path: Path, state: dict[str, Tensor], **meta: Any) -> Pa
     return path
 
 
-class ConvModule(nn.Module):
-    """mmcv's: a 1x1 convolution on (B, C, H, W), its normalization and a ReLU."""
-
-    def __init__(self, channels: int, width: int) -> None:
-        super().__init__()
-        self.conv = nn.Conv2d(channels, width, 1, bias=False)
-        self.bn = nn.BatchNorm2d(width)
-
-    def forward(self, features: Tensor) -> Tensor:
-        return torch.relu(self.bn(self.conv(features)))
-
-
-class MapDetector(nn.Module):
-    """SECOND and SECONDFPN, blocks and upsamplings of one neck in modules of their own."""
-
-    backbone: Any
-    neck: Any
-
-    def __init__(
-        self, channels: int, widths: Sequence[int], convs: Sequence[int], strides: Sequence[int], up: int
-    ) -> None:
-        super().__init__()
-        self.backbone, self.neck = nn.Module(), nn.Module()
-        self.backbone.blocks, self.neck.deblocks = map_layers(channels, widths, convs, strides, up, pad_first=False)
-
-    def above(self, canvas: Tensor) -> Tensor:
-        return map_features(self.backbone.blocks, self.neck.deblocks, canvas)
+NAMES = {
+    r"^vfe\.": "voxel_encoder.",
+    r"^backbone_3d\.conv(\d)\.": r"middle_encoder.encoder_layers.encoder_layer\1.",
+    r"^backbone_3d\.": "middle_encoder.",
+    r"^backbone_2d\.blocks\.": "backbone.blocks.",
+    r"^backbone_2d\.": "neck.",
+    r"^dense_head\.conv_box": "dense_head.conv_reg",
+    r"^pfe\.SA_rawpoints\.": "points_encoder.rawpoints_sa_layer.",
+    r"^pfe\.SA_layers\.": "points_encoder.voxel_sa_layers.",
+    r"^pfe\.vsa_point_feature_fusion\.": "points_encoder.point_feature_fusion_layer.",
+    r"^point_head\.cls_layers\.": "roi_head.semantic_head.seg_cls_layer.",
+    r"^roi_head\.roi_grid_pool_layer\.": "roi_head.bbox_roi_extractor.roi_grid_pool_layer.",
+    r"^roi_head\.shared_fc_layer\.": "roi_head.bbox_head.shared_fc_layer.",
+    r"^roi_head\.(cls|reg)_layers\.": r"roi_head.bbox_head.\1_layer.",
+}
+# Of layers that are modules of mmcv, the places of convolution and normalization in OpenPCDet's sequence.
+BALL = {
+    str(3 * number + place): f"layer{number}.{part}" for number in range(3) for place, part in enumerate(("conv", "bn"))
+}
+CONNECTED = {"0": "0.conv", "1": "0.bn", "4": "2.conv", "5": "2.bn", "7": "3"}
+MODULES = (
+    (r"(sa_layers?\.(?:\d\.)?mlps\.\d|grid_pool_layer\.mlps\.\d)\.(\d)\.", BALL),
+    (r"(point_feature_fusion_layer|bbox_head\.\w+_layer)\.(\d)\.", CONNECTED),
+)
 
 
-class Anchor3DHead(AnchorHead):
-    """Its three 1x1 convolutions."""
+def in_mmdetection3d(state: Mapping[str, Tensor], head: str) -> dict[str, Tensor]:
+    """Weights of OpenPCDet's network as mmdetection3d stores them; `head` is its name for the head of anchors."""
+    found = {}
+    for name, value in state.items():
+        for there, here in NAMES.items():
+            name = re.sub(there, here, name)
+        name = re.sub(r"^dense_head", head, name)
+        # A block begins with a padding of its own there, and with none here.
+        name = re.sub(r"^(backbone\.blocks\.\d)\.(\d+)", lambda m: f"{m[1]}.{int(m[2]) - 1}", name)
+        for layers, places in MODULES:
+            if layer := re.search(layers, name):
+                name = name.replace(layer[0], f"{layer[1]}.{places[layer[2]]}.")
+        if value.ndim > 1 and re.search(r"roi_head\.bbox_head|fusion_layer", name):  # 1x1 convolutions on maps
+            value = value.reshape(*value.shape[:2], 1, 1)
+        found[name] = value
+    return found
 
-    BOXES = "conv_reg"
 
-
-class PointPillars(MapDetector):
+class PointPillars(foreign_networks.PointPillars):
     """PillarFeatureNet, SECOND, SECONDFPN and Anchor3DHead."""
 
-    voxel_encoder: Any
-
-    def __init__(self, channels: int, widths: Sequence[int], convs: Sequence[int], up: int, classes: int) -> None:
-        super().__init__(channels, widths, convs, (2, 2, 2), up)
-        self.voxel_encoder = nn.Module()
-        self.voxel_encoder.pfn_layers = nn.ModuleList([PillarLayer(channels)])
-        self.bbox_head = Anchor3DHead(3 * up, 2 * classes, classes)
+    def state_dict(self, *_: Any, **__: Any) -> Any:
+        return in_mmdetection3d(super().state_dict(), "bbox_head")
 
 
-def set_abstraction(channels: int, radii: int, widths: Sequence[int]) -> nn.Module:
-    """StackedSAModuleMSG: an MLP for each radius, whose layers have names."""
-    module = nn.Module()
-    module.mlps = nn.ModuleList()
-    for _ in range(radii):
-        mlp, read = nn.Sequential(), 3 + channels
-        for number, width in enumerate(widths):
-            mlp.add_module(f"layer{number}", ConvModule(read, width))
-            read = width
-        module.mlps.append(mlp)
-    return module
+class PvRcnn(foreign_networks.PvRcnn):
+    """SparseEncoder, SECOND, SECONDFPN, PartA2RPNHead, VoxelSetAbstraction and PVRCNNRoiHead."""
 
-
-def fully_connected(channels: int, hidden: int, out: int | None) -> nn.Sequential:
-    """Of PVRCNNBBoxHead, on (R, C, 1, 1)."""
-    layers: list[nn.Module] = [ConvModule(channels, hidden), nn.Dropout(0.3), ConvModule(hidden, hidden)]
-    return nn.Sequential(*layers, *([] if out is None else [nn.Conv2d(hidden, out, 1)]))
-
-
-class PvRcnn(MapDetector):
-    """SparseEncoder, SECOND, SECONDFPN, PartA2RPNHead, VoxelSetAbstraction and PVRCNNRoiHead.
-
-    Args:
-        widths: of the four stages of the encoder and of its output.
-        neck: output channels of blocks, convolutions after each one's first, output channels after upsampling.
-        classes: how many.
-        balls: of raw points (first) and of the stages that are read: channels of the source, radii, MLP.
-        keypoint: channels of a fused feature.
-        weighting: hidden channels of the foreground segmentation.
-        grid: grid points along an axis, radii, MLP, hidden channels.
-    """
-
-    middle_encoder: Any
-    points_encoder: Any
-    roi_head: Any
-
-    def __init__(
-        self,
-        widths: Sequence[int],
-        neck: tuple[Sequence[int], Sequence[int], int],
-        classes: int,
-        balls: Sequence[tuple[int, int, Sequence[int]]],
-        keypoint: int,
-        weighting: int,
-        grid: tuple[int, int, Sequence[int], int],
-    ) -> None:
-        super().__init__(2 * widths[4], neck[0], neck[1], (1, 2), neck[2])
-        self.middle_encoder = nn.Module()
-        self.middle_encoder.conv_input = SparseLayer(4, widths[0], (3, 3, 3))
-        self.middle_encoder.encoder_layers = nn.Module()
-        for stage in range(4):
-            reads = (widths[0],) if stage == 0 else (widths[stage - 1], widths[stage], widths[stage])
-            layers = nn.Sequential(*(SparseLayer(read, widths[stage], (3, 3, 3)) for read in reads))
-            setattr(self.middle_encoder.encoder_layers, f"encoder_layer{stage + 1}", layers)
-        self.middle_encoder.conv_out = SparseLayer(widths[3], widths[4], (3, 1, 1))
-        self.rpn_head = Anchor3DHead(2 * neck[2], 2 * classes, classes)
-        self.points_encoder = nn.Module()
-        self.points_encoder.rawpoints_sa_layer, *others = (set_abstraction(*each) for each in balls)
-        self.points_encoder.voxel_sa_layers = nn.ModuleList(others)
-        joined = 2 * widths[4] + sum(radii * mlp[-1] for _, radii, mlp in balls)
-        self.points_encoder.point_feature_fusion_layer = nn.Sequential(ConvModule(joined, keypoint))
-        self.roi_head = nn.Module()
-        self.roi_head.semantic_head = nn.Module()
-        self.roi_head.semantic_head.seg_cls_layer = foreground(joined, weighting)
-        size, radii, mlp, hidden = grid
-        self.roi_head.bbox_roi_extractor = nn.Module()
-        self.roi_head.bbox_roi_extractor.roi_grid_pool_layer = set_abstraction(keypoint, radii, mlp)
-        self.roi_head.bbox_head = nn.Module()
-        self.roi_head.bbox_head.shared_fc_layer = fully_connected(size**3 * radii * mlp[-1], hidden, None)
-        self.roi_head.bbox_head.cls_layer = fully_connected(hidden, hidden, 1)
-        self.roi_head.bbox_head.reg_layer = fully_connected(hidden, hidden, 7)
+    def state_dict(self, *_: Any, **__: Any) -> Any:
+        return in_mmdetection3d(super().state_dict(), "rpn_head")

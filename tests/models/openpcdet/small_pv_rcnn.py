@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -14,7 +14,7 @@ from asca_pillars.models.pv_rcnn.layers import PvRcnn as OurNetwork
 from asca_pillars.models.pv_rcnn.network import PvRcnnDetector
 from asca_pillars.ops.pv_rcnn.voxels import VoxelGrid
 from asca_pillars.ops.two_stage.prepare import grid_neighbors
-from tests.models.openpcdet.foreign_networks import pooled
+from tests.models.openpcdet.foreign_networks import PvRcnn, pooled
 from tests.models.pv_rcnn import tiny_pv_rcnn
 from tests.models.pv_rcnn.tiny_pv_rcnn import SETTINGS, batch, frame
 from tests.ops.sparse.dense_volumes import at_cells, dense
@@ -25,37 +25,27 @@ SPEC = dataclasses.replace(  # with the strides of the published model, which ha
 MODEL = dataclasses.replace(tiny_pv_rcnn.MODEL, spec=SPEC)
 
 
-class Parts(NamedTuple):
-    """The parts of somebody else's PV-RCNN, by what they compute."""
-
-    blocks: Sequence[Sequence[Any]]
-    """Convolution and normalization of each layer of conv1 to conv4 and of conv_out."""
-    backbone: Callable[[Tensor], Tensor]
-    head: Callable[[Tensor], Sequence[Tensor]]
-    balls: Sequence[Sequence[torch.nn.Module]]
-    """Of each source, an MLP for each radius."""
-    fuse: Callable[[Tensor], Tensor]
-    weigh: Callable[[Tensor], Tensor]
-    grid_balls: Sequence[torch.nn.Module]
-    shared: Callable[[Tensor], Tensor]
-    """Of the channels of a whole grid, those of its points side by side: (R, C * points) -> (R, hidden)."""
-    confidence: Callable[[Tensor], Tensor]
-    residuals: Callable[[Tensor], Tensor]
-
-
-def assert_same_parts(theirs: Parts, ours: OurNetwork) -> None:
+def assert_same_parts(theirs: PvRcnn, ours: OurNetwork) -> None:
     """Every part of MODEL's network gives what their part gives of the same input."""
+    backbone, pfe, head = theirs.backbone_3d, theirs.pfe, theirs.roi_head
+    blocks = [
+        [backbone.conv_input, *backbone.conv1],
+        backbone.conv2,
+        backbone.conv3,
+        backbone.conv4,
+        [backbone.conv_out],
+    ]
     detector = PvRcnnDetector(MODEL, ours).eval()
     scans = batch(detector, frame(0)).scans
     with torch.inference_mode():
         first = ours.propose(scans)
-        volumes = voxel_volumes(theirs.blocks, scans)
+        volumes = voxel_volumes(blocks, scans)
         for level, volume, own in zip(first.levels, volumes, scans.levels, strict=True):
             torch.testing.assert_close(
                 level.double(), torch.from_numpy(at_cells(volume, own.cells.numpy())), atol=1e-4, rtol=1e-4
             )
         seen_from_above = volumes[-1].float().flatten(1, 2)  # (1, C * D, H, W)
-        for ours_map, their_map in zip(first.maps, theirs.head(theirs.backbone(seen_from_above)), strict=True):
+        for ours_map, their_map in zip(first.maps, theirs.dense_head(theirs.backbone_2d(seen_from_above)), strict=True):
             torch.testing.assert_close(ours_map, their_map, atol=1e-4, rtol=1e-3)
 
         described, logits = ours.encode_keypoints(scans, first.levels, first.canvas)
@@ -63,24 +53,25 @@ def assert_same_parts(theirs: Parts, ours: OurNetwork) -> None:
         parts: Any = [sum(cells[scans.bev_cells[:, i]] * scans.bev_weights[:, i, None] for i in range(4))]
         sources = {"points": scans.points[:, 3:], "conv2": first.levels[1], "conv4": first.levels[3]}
         balls = iter(scans.ball_indices)
-        for mlps, positions, rows in zip(theirs.balls, scans.positions, sources.values(), strict=True):
-            parts += [pooled(mlp, positions, rows, scans.keypoints, next(balls)) for mlp in mlps]
+        layers = (pfe.SA_rawpoints, *pfe.SA_layers)
+        for layer, positions, rows in zip(layers, scans.positions, sources.values(), strict=True):
+            parts += [pooled(mlp, positions, rows, scans.keypoints, next(balls)) for mlp in layer.mlps]
         joined = torch.cat(parts, dim=1)  # theirs: map, raw points, levels
-        their_logits = theirs.weigh(joined)
+        their_logits = theirs.point_head.cls_layers(joined)
         torch.testing.assert_close(logits, their_logits[:, 0], atol=1e-4, rtol=1e-3)
-        their_features = theirs.fuse(joined) * torch.sigmoid(their_logits)
+        their_features = pfe.vsa_point_feature_fusion(joined) * torch.sigmoid(their_logits)
         torch.testing.assert_close(described, their_features, atol=1e-4, rtol=1e-3)
 
         boxes = frame(0).boxes[:3]
         grid = grid_neighbors(scans.keypoints.numpy(), boxes, SETTINGS)
         indices, points = [torch.from_numpy(index) for index in grid.indices], torch.from_numpy(grid.points)
         confidence, residuals = ours.refine(scans.keypoints, described, points, indices)
-        pairs = zip(theirs.grid_balls, indices, strict=True)
+        pairs = zip(head.roi_grid_pool_layer.mlps, indices, strict=True)
         balls_of = [pooled(mlp, scans.keypoints, described, points, index) for mlp, index in pairs]
         of_grid = torch.cat(balls_of, dim=1).view(len(boxes), SETTINGS.grid_size**3, -1)
-        shared = theirs.shared(of_grid.permute(0, 2, 1).reshape(len(boxes), -1))
-        torch.testing.assert_close(confidence, theirs.confidence(shared)[:, 0], atol=1e-4, rtol=1e-3)
-        torch.testing.assert_close(residuals, theirs.residuals(shared), atol=1e-4, rtol=1e-3)
+        shared = head.shared_fc_layer(of_grid.permute(0, 2, 1).reshape(len(boxes), -1, 1))
+        torch.testing.assert_close(confidence, head.cls_layers(shared)[:, 0, 0], atol=1e-4, rtol=1e-3)
+        torch.testing.assert_close(residuals, head.reg_layers(shared)[..., 0], atol=1e-4, rtol=1e-3)
 
 
 def voxel_volumes(blocks: Sequence[Sequence[Any]], scans: Any) -> list[Tensor]:

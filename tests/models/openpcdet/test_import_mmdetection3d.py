@@ -3,7 +3,6 @@
 import dataclasses
 import math
 import pickle
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +11,6 @@ import pytest
 import torch
 from torch import Tensor
 
-from asca_export.pillar.export import export_pillar_bundle
 from asca_pillars.base.errors import ConfigError, TrainingError
 from asca_pillars.config.pillar import PillarModel
 from asca_pillars.config.pv_rcnn import PvRcnnModel
@@ -21,14 +19,12 @@ from asca_pillars.models.checkpoint import Checkpoint, load_checkpoint
 from asca_pillars.models.openpcdet.import_checkpoint import published_config, read_foreign, write_imported
 from asca_pillars.models.pillar.network import PillarDetector
 from asca_pillars.models.pv_rcnn.network import PvRcnnDetector
-from tests.export.deployed import assert_same_detector
-from tests.export.tiny import SCANS
 from tests.models.openpcdet.foreign_networks import random_weights
 from tests.models.openpcdet.mmdetection3d_networks import PointPillars, PvRcnn, write_mmdetection3d
 from tests.models.openpcdet.small_pointpillars import NETWORK, assert_same_boxes, assert_same_parts, padded
 from tests.models.openpcdet.small_pointpillars import SPEC as OPENPCDET_SPEC
 from tests.models.openpcdet.small_pv_rcnn import CONFIG as PV_RCNN_CONFIG
-from tests.models.openpcdet.small_pv_rcnn import PUBLISHED_CHANNELS, Parts, foreign_pv_rcnn, in_layout
+from tests.models.openpcdet.small_pv_rcnn import PUBLISHED_CHANNELS, foreign_pv_rcnn, in_layout
 from tests.models.openpcdet.small_pv_rcnn import assert_same_parts as assert_same_pv_rcnn
 
 PUBLISHED = load_config("mmdetection3d_pointpillars_kitti").model.spec
@@ -60,12 +56,12 @@ def imported(foreign: PointPillars, folder: Path, **meta: Any) -> Checkpoint:
 def test_every_part_gives_what_theirs_gives(foreign: PointPillars, tmp_path: Path, legacy: bool) -> None:
     checkpoint = imported(foreign, tmp_path, **({} if legacy else {"cfg": NOT_LEGACY}))
     assert isinstance(checkpoint.detector, PillarDetector) and checkpoint.steps == 37120
-    layer = foreign.voxel_encoder.pfn_layers[0]
+    layer = foreign.vfe.pfn_layers[0]
     assert_same_parts(
         checkpoint.detector,
         lambda pillars: layer(padded(pillars, legacy=legacy)),
-        foreign.above,
-        foreign.bbox_head,
+        foreign.backbone_2d,
+        foreign.dense_head,
     )
 
 
@@ -78,13 +74,6 @@ def centers(count: int, low: float, high: float) -> Tensor:
 def test_boxes_are_decoded_as_theirs() -> None:
     anchors = [(0.8, 0.6, 1.73, -0.6), (1.76, 0.6, 1.73, -0.6), (3.9, 1.6, 1.56, -1.78)]
     assert_same_boxes(SPEC, centers, anchors, -math.pi / 2)
-
-
-def test_it_runs_as_a_bundle_with_its_direction_bins(foreign: PointPillars, tmp_path: Path) -> None:
-    checkpoint = imported(foreign, tmp_path)
-    bundle = export_pillar_bundle(checkpoint, tmp_path / "bundle", SCANS)
-    assert bundle.spec.direction_offset_rad == -math.pi / 2
-    assert_same_detector(checkpoint, tmp_path / "bundle")
 
 
 def test_the_published_models_have_their_published_sizes(tmp_path: Path) -> None:
@@ -111,26 +100,7 @@ def test_every_part_of_pv_rcnn_gives_what_theirs_gives(tmp_path: Path) -> None:
     write_imported(weights, PV_RCNN_CONFIG, tmp_path / "ours.ckpt")
     detector = load_checkpoint(tmp_path / "ours.ckpt").detector
     assert isinstance(detector, PvRcnnDetector)
-    encoder, points, roi = theirs.middle_encoder, theirs.points_encoder, theirs.roi_head
-    stages = [getattr(encoder.encoder_layers, f"encoder_layer{number}") for number in range(1, 5)]
-
-    def convolved(layers: torch.nn.Module) -> Callable[[Tensor], Tensor]:
-        return lambda rows: layers(rows[..., None, None])[..., 0, 0]
-
-    head = roi.bbox_head
-    parts = Parts(
-        [[encoder.conv_input, *stages[0]], *map(list, stages[1:]), [encoder.conv_out]],
-        theirs.above,
-        theirs.rpn_head,
-        [list(layer.mlps) for layer in (points.rawpoints_sa_layer, *points.voxel_sa_layers)],
-        convolved(points.point_feature_fusion_layer),
-        roi.semantic_head.seg_cls_layer,
-        list(roi.bbox_roi_extractor.roi_grid_pool_layer.mlps),
-        convolved(head.shared_fc_layer),
-        convolved(head.cls_layer),
-        convolved(head.reg_layer),
-    )
-    assert_same_pv_rcnn(parts, detector.network)
+    assert_same_pv_rcnn(theirs, detector.network)
 
 
 class HistoryBuffer:

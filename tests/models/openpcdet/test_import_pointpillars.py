@@ -1,5 +1,6 @@
 """OpenPCDet's PointPillars, imported: the same values after every part, then a bundle that finds the same boxes."""
 
+import dataclasses
 import math
 import pickle
 from pathlib import Path
@@ -52,7 +53,13 @@ def test_boxes_are_decoded_as_theirs() -> None:
 
 
 def test_it_runs_as_a_bundle(imported: Checkpoint, tmp_path: Path) -> None:
+    """Anchors from end to end, and directions as mmdetection3d has them."""
+    assert isinstance(imported.config.model, PillarModel)
+    spec = dataclasses.replace(SPEC, direction_offset_rad=-math.pi / 2)
+    model = dataclasses.replace(imported.config.model, spec=spec)
+    imported = imported._replace(config=dataclasses.replace(imported.config, model=model))
     bundle = export_pillar_bundle(imported, tmp_path / "bundle", SCANS)
+    assert bundle.spec.direction_offset_rad == -math.pi / 2
     assert bundle.parity is not None and bundle.provenance.steps == 18560
     assert bundle.spec.anchor_places == "ends" and bundle.spec.anchor_scores == "every"
     assert_same_detector(imported, tmp_path / "bundle")

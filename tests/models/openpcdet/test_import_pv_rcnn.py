@@ -1,12 +1,10 @@
 """OpenPCDet's PV-RCNN, imported from both versions of spconv: the same values after every part."""
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
-from torch import Tensor
 
 from asca_pillars.config.pv_rcnn import PvRcnnModel
 from asca_pillars.config.tree import load_config
@@ -19,7 +17,6 @@ from tests.models.openpcdet.small_pv_rcnn import (
     CONFIG,
     LAYOUTS,
     PUBLISHED_CHANNELS,
-    Parts,
     assert_same_parts,
     foreign_pv_rcnn,
     in_layout,
@@ -53,24 +50,7 @@ def test_sparse_weights_of_every_layout_are_the_dense_ones(foreign: PvRcnn, tmp_
 
 
 def test_every_part_gives_what_theirs_gives(foreign: PvRcnn, tmp_path: Path) -> None:
-    ours, part, pfe, head = imported(foreign, tmp_path), foreign.backbone_3d, foreign.pfe, foreign.roi_head
-
-    def fully_connected(layers: torch.nn.Module) -> Callable[[Tensor], Tensor]:
-        return lambda rows: layers(rows[..., None])[..., 0]
-
-    parts = Parts(
-        [[part.conv_input, *part.conv1], list(part.conv2), list(part.conv3), list(part.conv4), [part.conv_out]],
-        foreign.backbone_2d,
-        foreign.dense_head,
-        [list(layer.mlps) for layer in (pfe.SA_rawpoints, *pfe.SA_layers)],
-        pfe.vsa_point_feature_fusion,
-        foreign.point_head.cls_layers,
-        list(head.roi_grid_pool_layer.mlps),
-        fully_connected(head.shared_fc_layer),
-        fully_connected(head.cls_layers),
-        fully_connected(head.reg_layers),
-    )
-    assert_same_parts(parts, ours)
+    assert_same_parts(foreign, imported(foreign, tmp_path))
 
 
 def test_the_published_model_fits(tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
 """The whole network: Table 1's shapes and sizes, and that a feature cell lies where its anchor stands."""
 
-from typing import Literal
+import dataclasses
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -12,8 +13,10 @@ from asca_pillars.models.map_backbone import as_map
 from asca_pillars.models.pillar.neck import RPNNeck
 from asca_pillars.models.pillar.network import PillarDetector, build_pillar_detector
 from asca_pillars.models.pillar.preparation import batch_pillars
-from asca_pillars.ops.pillar.grid import PillarGrid
+from asca_pillars.ops.pillar.grid import PillarGrid, pool_pillars
 from asca_pillars.ops.pillar.spec import PillarSpec
+from tests.helpers.scenes import SPEC as SCENES
+from tests.helpers.scenes import make_scene
 
 # Rectangular, asymmetric, away from zero: a swapped axis or a forgotten minimum cannot hide.
 SPEC = PillarSpec(grid=PillarGrid(x_range_m=(4.8, 20.16), y_range_m=(-7.68, 12.8), v_max_m=0.32, zones=3))
@@ -30,24 +33,22 @@ def _points(count: int = 600, seed: int = 0) -> np.ndarray:
     return rng.uniform(low, high, (count, 4)).astype(np.float32)
 
 
-def test_neck_has_table_1s_widths_and_size() -> None:
+def test_neck_and_network_have_table_1s_widths_and_sizes() -> None:
     neck = RPNNeck(64, (64, 128, 256), (3, 3, 3), 128)
     assert neck(torch.zeros(1, 64, 16, 24)).shape == (1, 384, 8, 12)
     convolutions = 4 * 64 * 64 * 9 + (64 + 3 * 128) * 128 * 9 + (128 + 3 * 256) * 256 * 9
     upsampling = 64 * 128 + 128 * 128 * 4 + 256 * 128 * 16
     normalization = 2 * (4 * 64 + 4 * 128 + 4 * 256 + 3 * 128)
-    assert sum(p.numel() for p in neck.parameters()) == convolutions + upsampling + normalization == 3_330_304
 
+    def count(**network: Any) -> int:
+        model = PillarModel(network=NetworkConfig(cpa="none", **network))
+        return sum(p.numel() for p in build_pillar_detector(model).parameters())
 
-def test_whole_network_size() -> None:
-    def count(network: NetworkConfig) -> int:
-        return sum(p.numel() for p in build_pillar_detector(PillarModel(network=network)).parameters())
-
-    head = 384 * (6 + 42 + 12) + 60
-    pfn = 9 * 64 + 128
-    assert count(NetworkConfig(cpa="none")) == 3_330_304 + head + pfn == 3_354_108
+    of_neck, head, pfn = convolutions + upsampling + normalization, 384 * (6 + 42 + 12) + 60, 9 * 64 + 128
+    assert sum(p.numel() for p in neck.parameters()) == of_neck == 3_330_304
+    assert count() == of_neck + head + pfn == 3_354_108
     # The original PointPillars has blocks of 3, 5 and 5 convolutions after the strided one: about 4.8 M parameters.
-    original = count(NetworkConfig(cpa="none", block_convs=(3, 5, 5)))
+    original = count(block_convs=(3, 5, 5))
     assert original == 3_354_108 + 2 * (128 * 128 * 9 + 256) + 2 * (256 * 256 * 9 + 512)
     assert round(original / 1e6, 1) == 4.8
 
@@ -120,3 +121,45 @@ def test_a_map_has_its_channels_first_and_is_copied_where_gradients_are_slow_oth
     assert found.shape == (2, 5, 3, 4)
     assert torch.equal(found[1, :, 2, 3], cells[1, 2, 3])
     assert found.is_contiguous() == copied
+
+
+POOLED = dataclasses.replace(SCENES, grid=dataclasses.replace(SCENES.grid, map="pooled"))
+NETWORK = NetworkConfig(pillar_channels=8, block_channels=(8, 12, 16), block_convs=(1, 1, 1), upsample_channels=8)
+EMPTY = np.empty((0, 4), np.float32)
+
+
+def pooled_detector(neck: Literal["dense", "sparse"]) -> PillarDetector:
+    torch.manual_seed(0)
+    return build_pillar_detector(PillarModel(spec=POOLED, network=dataclasses.replace(NETWORK, neck=neck))).eval()
+
+
+@pytest.mark.parametrize("neck", ["dense", "sparse"])
+def test_frames_are_pooled_as_the_runtime_does_and_stay_apart(neck: Literal["dense", "sparse"]) -> None:
+    detector = pooled_detector(neck)
+    frames = [POOLED.pillarize(points) for points in (make_scene(0)[0], EMPTY, make_scene(1)[0])]
+    placements = [detector.preparation.place(frame) for frame in frames]
+    batch = batch_pillars(frames, placements)
+    with torch.inference_mode():
+        encoded = detector.encode(batch.features, batch.pillar_index, batch.point_counts, batch.frame_pillars)
+        features, cells, frame_cells = detector.pool(encoded, batch)
+    assert encoded.min() < 0 and sum(frame_cells) == len(cells) and frame_cells[1] == 0
+    parts = encoded.split(list(batch.frame_pillars))
+    for frame, own, found, where in zip(
+        frames, parts, features.split(list(frame_cells)), cells.split(list(frame_cells)), strict=True
+    ):
+        pooled, occupied = pool_pillars(own.numpy(), frame.cells, POOLED.grid)
+        np.testing.assert_array_equal(found.numpy(), pooled)
+        np.testing.assert_array_equal(where.numpy(), occupied)
+    with torch.inference_mode():
+        together = detector(batch).scores
+        alone = detector(batch_pillars(frames[2:], placements[2:])).scores
+    torch.testing.assert_close(together[-len(alone) :], alone, rtol=0, atol=1e-5)
+
+
+def test_gradients_reach_every_pillar_that_is_largest_somewhere() -> None:
+    detector = pooled_detector("sparse").train()
+    frame = POOLED.pillarize(make_scene(0)[0])
+    batch = batch_pillars([frame], [detector.preparation.place(frame)])
+    detector(batch).scores.square().sum().backward()
+    gradient = detector.encode.linear.weight.grad
+    assert gradient is not None and torch.isfinite(gradient).all() and gradient.abs().min() > 0

@@ -19,7 +19,7 @@ from asca_pillars.models.pv_rcnn.keypoints import (
 from asca_pillars.ops.points.neighbors import PointScale, point_scales, three_nearest
 from asca_pillars.ops.points.sampling import farthest_points
 from asca_pillars.ops.pv_rcnn.prepare import Deform, SourceBalls, VoxelSetSettings
-from tests.models.pv_rcnn.tiny_pv_rcnn import SETTINGS, VARIANTS, batch, frame, tiny_detector
+from tests.models.pv_rcnn.tiny_pv_rcnn import SETTINGS, batch, frame, tiny_detector
 from tests.ops.points.clouds import cloud
 
 
@@ -94,18 +94,6 @@ def test_coarse_features_reach_every_keypoint() -> None:
         expected = module.join(torch.from_numpy(np.concatenate([of_scales[0], brought], axis=1))).numpy()
     assert found.shape == (40, 5)
     np.testing.assert_allclose(found, expected, atol=1e-6)
-
-
-def test_scales_of_a_batch_are_those_of_its_frames() -> None:
-    detector = tiny_detector(**VARIANTS["adaptive scales"]).eval()
-    together = batch(detector, frame(0), frame(1)).scans
-    alone = [batch(detector, each).scans for each in (frame(0), frame(1))]
-    scales = detector.network.scales
-    assert scales is not None
-    with torch.inference_mode():
-        found = scales(together.points, together.scales)
-        expected = torch.cat([scales(each.points, each.scales) for each in alone])
-    torch.testing.assert_close(found, expected, atol=1e-5, rtol=1e-4)
 
 
 def test_scales_that_cannot_be() -> None:
@@ -185,20 +173,6 @@ def test_places_learn_unless_they_are_frozen(deform: Deform) -> None:
     else:
         assert gradients and all(gradient is not None and gradient.any() for gradient in gradients.values())
         assert of_backbone is not None and of_backbone.any()
-
-
-def test_balls_are_around_the_shifted_places() -> None:
-    detector = tiny_detector(settings=dataclasses.replace(SETTINGS, deform="authors")).eval()
-    for weight in detector.network.deform.parameters():
-        torch.nn.init.normal_(weight)
-    together = batch(detector, frame(0), frame(1)).scans
-    alone = [batch(detector, each).scans for each in (frame(0), frame(1))]
-    described = []
-    with torch.inference_mode():
-        for scans in (together, *alone):
-            first = detector.network.propose(scans)
-            described.append(detector.network.encode_keypoints(scans, first.levels, first.canvas)[0])
-    torch.testing.assert_close(described[0], torch.cat(described[1:]), atol=1e-4, rtol=1e-3)
 
 
 def test_a_deformation_without_a_level() -> None:

@@ -77,6 +77,9 @@ def test_only_what_is_missing_damaged_or_changed_is_computed_again(
     for _ in range(2):
         cache.fill(split)
         assert stage.calls == 3
+    split.scan_path("000000").unlink()
+    with pytest.raises(AscaError, match=r"000000\.bin"):
+        cache.fill(split)
     same_scan = np.array_equal(cache.files.read("000001").keypoints, cache.files.read("000000").keypoints)
     assert same_scan == (change == "another scan")
 
@@ -89,14 +92,6 @@ def test_other_axes_are_other_proposals(tmp_path: Path) -> None:
     (root / "dataset.yaml").write_text("axes: y-forward")
     cache.fill(BoxSplit(root))
     assert stage.calls == 4
-
-
-def test_a_scan_that_is_gone_is_named(split: KittiSplit, tmp_path: Path) -> None:
-    cache = ProposalCache(tmp_path / "prepared", "pool", RandomStage(), SETTINGS)
-    cache.fill(split)
-    split.scan_path("000001").unlink()
-    with pytest.raises(AscaError, match=r"000001\.bin"):
-        cache.fill(split)
 
 
 def test_a_killed_run_leaves_no_half_file(split: KittiSplit, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -39,17 +39,17 @@ def test_points_that_no_ball_reaches_are_left_out_and_no_others() -> None:
         inside = np.minimum((away < radius_m).sum(axis=1), GEOMETRY.ball_samples)
         for row, count in zip(indices, inside, strict=True):
             assert len(np.unique(row)) == pytest.approx(count, abs=0)
-
-
-def test_a_second_thread_finds_the_same_neighbors() -> None:
-    points = make_scene(0)[0]
-    proposed = run_first_stage(RandomStage(), points, SETTINGS)
-    alone = refine_scan(points, proposed, proposed.proposals, GEOMETRY)
-    with ThreadPoolExecutor(1) as executor:
-        found = refine_scan(points, proposed, proposed.proposals, GEOMETRY, executor)
-    for one, two in zip(alone.ball_indices + alone.grid_indices, found.ball_indices + found.grid_indices, strict=True):
+    with ThreadPoolExecutor(1) as executor:  # a second thread finds the same
+        second = refine_scan(points, proposed, proposed.proposals, GEOMETRY, executor)
+    for one, two in zip(
+        found.ball_indices + found.grid_indices, second.ball_indices + second.grid_indices, strict=True
+    ):
         np.testing.assert_array_equal(one, two)
-    np.testing.assert_array_equal(alone.grid_points, found.grid_points)
+    np.testing.assert_array_equal(found.grid_points, second.grid_points)
+    features = roi_features(proposals := proposed.proposals)
+    assert (features[:, :3].argmax(axis=1) == proposals.labels).all()
+    np.testing.assert_allclose(1 / (1 + np.exp(-features[:, 3])), proposals.scores, rtol=1e-4)
+    np.testing.assert_array_equal(features[:, 4:], proposals.boxes[:, 3:6])
 
 
 def test_indices_of_a_batch_point_at_the_same_rows() -> None:
@@ -65,14 +65,6 @@ def test_indices_of_a_batch_point_at_the_same_rows() -> None:
         alone = [np.concatenate([s.keypoints, np.full((1, 3), np.nan)])[s.grid_indices[radius]] for s in scans]
         np.testing.assert_array_equal(rows[together.numpy()], np.concatenate(alone))
         assert any((s.grid_indices[radius] == len(s.keypoints)).any() for s in scans), "some balls are empty"
-
-
-def test_roi_features() -> None:
-    proposals = run_first_stage(RandomStage(), make_scene(0)[0], SETTINGS).proposals
-    features = roi_features(proposals)
-    assert (features[:, :3].argmax(axis=1) == proposals.labels).all()
-    np.testing.assert_allclose(1 / (1 + np.exp(-features[:, 3])), proposals.scores, rtol=1e-4)
-    np.testing.assert_array_equal(features[:, 4:], proposals.boxes[:, 3:6])
 
 
 @pytest.mark.parametrize("change", [{"grid_size": 0}, {"ball_radii_m": (0.4, -1)}, {"grid_radii_m": ()}])

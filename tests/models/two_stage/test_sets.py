@@ -81,13 +81,6 @@ def test_an_empty_ball_is_the_mlp_of_zero_wherever_it_is() -> None:
         torch.testing.assert_close(module(positions, features, moved, indices)[1], zero)
 
 
-def test_no_points_and_no_queries() -> None:
-    module = SetAbstraction(1, (4,)).eval()
-    nothing = torch.zeros(3, 2, dtype=torch.int32)
-    assert module(torch.zeros(0, 3), torch.zeros(0, 1), torch.zeros(3, 3), nothing).shape == (3, 4)
-    assert module(torch.zeros(2, 3), torch.zeros(2, 1), torch.zeros(0, 3), nothing[:0]).shape == (0, 4)
-
-
 HALF_M = 0.8
 
 
@@ -141,18 +134,8 @@ def test_vector_pool_is_what_the_equations_say() -> None:
     assert np.abs(found[0] - found[1]).max() > 1e-3
 
 
-def test_where_a_point_stands_decides_which_weights_it_meets() -> None:
-    pool, features = random_pool(1), torch.ones(1, 1, dtype=torch.float64)
-    queries, found = torch.zeros(1, 3, dtype=torch.float64), []
-    for x in (-0.5, 0.5):
-        points = torch.tensor([[x, 0, 0]], dtype=torch.float64)
-        rows = torch.from_numpy(nearest_in_cubes(points.numpy(), queries.numpy(), HALF_M, 3))
-        found.append(pool(points, features, queries, rows))
-    assert (found[0] - found[1]).abs().max() > 1e-3
-
-
-def test_a_pool_of_no_points_and_no_queries() -> None:
-    pool = random_pool().float()
-    nothing = torch.zeros(3, 27, 3, dtype=torch.int32)
-    assert pool(torch.zeros(0, 3), torch.zeros(0, 4), torch.zeros(3, 3), nothing).shape == (3, 7)
-    assert pool(torch.zeros(2, 3), torch.zeros(2, 4), torch.zeros(0, 3), nothing[:0]).shape == (0, 7)
+def test_no_points_and_no_queries() -> None:
+    for module, indices in ((SetAbstraction(4, (7,)).eval(), (2,)), (random_pool().float(), (27, 3))):
+        nothing = torch.zeros(3, *indices, dtype=torch.int32)
+        assert module(torch.zeros(0, 3), torch.zeros(0, 4), torch.zeros(3, 3), nothing).shape == (3, 7)
+        assert module(torch.zeros(2, 3), torch.zeros(2, 4), torch.zeros(0, 3), nothing[:0]).shape == (0, 7)

@@ -1,4 +1,4 @@
-"""The second stage through the same training as a pillar detector: cached proposals, resume, average, evaluation."""
+"""Two stages through the same training as a pillar detector: resume, cached proposals, average, evaluation."""
 
 import copy
 import dataclasses
@@ -9,7 +9,8 @@ import pytest
 import torch
 
 from asca_pillars.base.errors import ConfigError, TrainingError
-from asca_pillars.config.tree import AugmentConfig, load_config
+from asca_pillars.config.pv_rcnn import PvRcnnModel
+from asca_pillars.config.tree import AugmentConfig, load_config, pillar_spec
 from asca_pillars.config.two_stage import RefineModel
 from asca_pillars.data.augment import move_scene
 from asca_pillars.data.frames import LabeledFrame, Motion
@@ -26,6 +27,8 @@ from asca_pillars.ops.two_stage.rois import match_proposals
 from asca_pillars.training.dataset import Batch, Collate, open_dataset
 from asca_pillars.training.loop import train
 from tests.helpers.scenes import SPEC, write_dataset
+from tests.models.pv_rcnn.tiny_pv_rcnn import MODEL, NETWORK, tiny_config
+from tests.models.pv_rcnn.tiny_pv_rcnn import SPEC as VOXELS
 from tests.models.two_stage.small_refiner import proposed_frame
 from tests.models.two_stage.tiny_refine import (
     STILL_OBJECTS,
@@ -41,18 +44,24 @@ def stage(tmp_path: Path) -> Path:
     return write_first_stage(tmp_path / "first.ckpt")
 
 
-def test_a_run_made_longer_is_the_longer_run(tmp_path: Path, stage: Path) -> None:
-    data = write_dataset(tmp_path / "data", 5)
-    long, short = (tiny_refine_config(stage, epochs=epochs) for epochs in (2, 1))
+@pytest.mark.parametrize("family", ["pillar_refine", "pv_rcnn"])
+def test_a_run_made_longer_is_the_longer_run(family: str, tmp_path: Path, stage: Path) -> None:
+    data = write_dataset(tmp_path / "data", 3)
+    long, short = (
+        tiny_refine_config(stage, epochs=epochs) if family == "pillar_refine" else tiny_config(epochs=epochs)
+        for epochs in (2, 1)
+    )
     straight = load_checkpoint(train(long, data, tmp_path / "straight"))
     train(short, data, tmp_path / "resumed")
     resumed = load_checkpoint(train(long, data, tmp_path / "resumed"))
-    assert straight.steps == resumed.steps == 4
-    assert straight.config.model.spec == SPEC, "taken from the first stage"
-    for (name, expected), found in zip(
-        straight.detector.state_dict().items(), resumed.detector.state_dict().values(), strict=True
-    ):
-        torch.testing.assert_close(found, expected, msg=name, rtol=0, atol=0)
+    assert straight.steps == resumed.steps == 2
+    spec = straight.config.model.spec
+    assert spec == (VOXELS if family == "pv_rcnn" else SPEC), "taken from the first stage"
+    torch.testing.assert_close(resumed.detector.state_dict(), straight.detector.state_dict(), rtol=0, atol=0)
+    points = KittiSplit(data, "val").points("000002", camera_view=True)
+    detect = ScanDetector(resumed.detector, spec.with_score_threshold(0.0))
+    assert np.isfinite((found := detect(points)).boxes).all() and len(found) > 0
+    assert len(detect(np.empty((0, 4), np.float32))) == 0
 
 
 def test_a_checkpoint_runs_both_stages(tmp_path: Path, stage: Path) -> None:
@@ -71,17 +80,6 @@ def test_a_checkpoint_runs_both_stages(tmp_path: Path, stage: Path) -> None:
     write_first_stage(stage, cpa="none")
     with pytest.raises(ConfigError, match=r"first\.ckpt: other weights are there"):
         ScanDetector(load_checkpoint(tmp_path / "run" / "checkpoints" / "last.ckpt").detector, model.spec)(points)
-
-
-def test_proposals_are_computed_once(tmp_path: Path, stage: Path) -> None:
-    data = write_dataset(tmp_path / "data", 3)
-    config = opened_config(stage)
-    open_dataset(data, config, training=True)
-    files = sorted((data / "prepared").glob("*/proposals-*/*.npz"))
-    assert [path.stem for path in files] == ["000000", "000001"]
-    times = [path.stat().st_mtime_ns for path in files]
-    open_dataset(data, config, training=True)
-    assert [path.stat().st_mtime_ns for path in files] == times
 
 
 def test_a_moved_scene_has_its_proposals_moved_with_it(tmp_path: Path, stage: Path) -> None:
@@ -164,3 +162,46 @@ def test_what_cannot_be(tmp_path: Path, stage: Path) -> None:
         with_first_stage(tiny_refine_model(tmp_path / "none.ckpt"))
     with pytest.raises(ConfigError, match=r"the map of .* has 48; leave it out"):
         with_first_stage(dataclasses.replace(tiny_refine_model(stage), bev_channels=47))
+
+
+def test_the_second_stage_alone_on_a_trained_first_one(tmp_path: Path) -> None:
+    data = write_dataset(tmp_path / "data", 3)
+    both = train(tiny_config(epochs=1), data, tmp_path / "both")
+    network = dataclasses.replace(NETWORK, hidden=16)
+    alone = tiny_config(dataclasses.replace(MODEL, network=network, train_first_stage=False), epochs=1)
+    alone = dataclasses.replace(alone, train=dataclasses.replace(alone.train, ema=0.9))  # an average of equal weights
+    with pytest.raises(TrainingError, match=r"train_first_stage = false: .* give .* --init"):
+        train(alone, data, tmp_path / "second")
+    weights = load_checkpoint(train(alone, data, tmp_path / "second", init=both)).detector.state_dict()
+    given = load_checkpoint(both).detector.state_dict()
+    kept = [name for name in weights if name.split(".")[1] in PvRcnnModel.FIRST_STAGE]
+    assert {name.split(".")[1] for name in kept} == {"voxels", "neck", "head"}
+    assert all(torch.equal(weights[name], given[name]) for name in kept)
+    assert weights["network.refine.confidence.0.weight"].shape != given["network.refine.confidence.0.weight"].shape
+    train(alone, data, tmp_path / "second")  # a run that is there has its first stage
+
+    wider = dataclasses.replace(network, voxel_channels=(4, 6, 8, 8, 16))
+    alone = tiny_config(dataclasses.replace(MODEL, network=wider, train_first_stage=False), epochs=1)
+    with pytest.raises(TrainingError, match=r"another network: network\.voxels\..* in this configuration"):
+        train(alone, data, tmp_path / "other", init=both)
+
+
+def test_what_pv_rcnn_cannot_be() -> None:
+    for override, message in (
+        ("model.rois=1", "model.rois = 1: must be at least 2"),
+        ("model.spec.grid.size_m=[0.1, 0.1, 0.05]", "81 voxels along z are more than 64"),
+        ("model.spec.grid.y_range_m=[-30.3, 30.3]", "606 voxels along y must be a multiple of 8"),
+        ("model.settings.sources=[{source: conv5, radii_m: [1], samples: [2]}]", "conv5"),
+        ("model.settings.keypoint=3", "did you mean `keypoints`"),
+        ("model.network.source_widths=[[8]]", "give one for each of model.settings.sources"),
+        ("model.network.dropout=1", "model.network.dropout = 1"),
+        ("model.network.grid_widths=[]", "model.network.grid_widths"),
+        ("model.network.block_convs=[-1, 1]", "model.network.block_convs"),
+        ("model.settings.keypoints=0", "keypoints 0"),
+        ("model.settings.grid_radii_m=[]", "grid_radii_m"),
+        ("model.kind=pvrcnn", "input should be"),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            load_config("pvrcnn_small_sim", [override])
+    with pytest.raises(ConfigError, match=r"model.kind = pv_rcnn: has no pillars"):
+        pillar_spec(load_config("pvrcnn_small_sim"))
