@@ -234,6 +234,18 @@ def test_the_first_loss_that_is_not_finite_stops_and_names_term_and_frames(tmp_p
         module.training_step(Collate(frames.preparation)([frames.sample(0, 1), frames.sample(0, 0)]), 0)
 
 
+def test_two_processes_train_together(tmp_path: Path) -> None:
+    data = write_dataset(tmp_path / "data", 9)
+    (tmp_path / "config.yaml").write_text(yaml.safe_dump(to_dict(with_train(epochs=1))))
+    command = [sys.executable, "-m", "asca_pillars.cli", "train", str(tmp_path / "config.yaml"), "--data", str(data)]
+    run = subprocess.run(
+        [*command, "--out", str(tmp_path / "run"), "--devices", "2"], capture_output=True, text=True, timeout=300
+    )
+    assert run.returncode == 0, run.stderr
+    # Eight training frames, two to a batch, two batches at a time.
+    assert load_checkpoint(tmp_path / "run" / "checkpoints" / "last.ckpt").steps == 2
+
+
 def test_devices_wait_for_each_other_only_where_all_take_part(monkeypatch: pytest.MonkeyPatch) -> None:
     assert not syncs_statistics(PillarModel())  # torch has it on GPUs alone
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
