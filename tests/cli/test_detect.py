@@ -1,8 +1,6 @@
 """`asca detect`: one result per scan whatever their names, one bad scan does not end the rest, and what it says."""
 
 import json
-from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +10,7 @@ import pytest
 
 from asca_deploy.result_files import ResultWriter
 from asca_pillars.base.errors import OutputError, ScanError
-from asca_pillars.cli import detect as command
+from asca_pillars.cli.detect import detect
 from asca_pillars.data.kitti import KittiSplit, read_labels
 from asca_pillars.scans.scan_reader import write_scan
 from tests.cli.short_drive import read_lines
@@ -20,12 +18,11 @@ from tests.deploy.conftest import make_scan
 from tests.helpers.scenes import write_dataset
 
 POINTS = make_scan(count=300)
-Detect = Callable[..., None]
 
 
-@pytest.fixture
-def detect(bundle: Path) -> Detect:
-    return partial(command.detect, bundle=bundle, threads=1)
+@pytest.fixture(autouse=True)
+def _tiny_model(bundle: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("asca_deploy.shipped.default_bundle_path", lambda: bundle)
 
 
 def write_scans(folder: Path, *names: str) -> Path:
@@ -38,13 +35,11 @@ def files(folder: Path) -> dict[str, bytes]:
     return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
-def test_dropped_points_and_arithmetic_are_said(
-    detect: Detect, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_dropped_points_and_arithmetic_are_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     points = POINTS.copy()
     points[:7, 0] = np.nan
     np.save(tmp_path / "scan.npy", points)
-    detect([tmp_path / "scan.npy"], out=tmp_path / "out", around=False)
+    detect([tmp_path / "scan.npy"], out=tmp_path / "out", threads=1, around=False)
     output = " ".join(capsys.readouterr().out.split())
     assert "scan.npy: 7 points are not finite and were dropped" in output and output.count("not finite") == 1
     assert "cpu float32, 1 threads" in output
@@ -53,7 +48,7 @@ def test_dropped_points_and_arithmetic_are_said(
 
 
 def test_a_damaged_scan_is_named_and_the_others_are_detected(
-    detect: Detect, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     scans, out = write_scans(tmp_path / "mix", "1.bin", "3.bin"), tmp_path / "out"
     (scans / "\x1b[31m\n2.bin").write_bytes(b"torn")
@@ -68,14 +63,14 @@ def test_a_damaged_scan_is_named_and_the_others_are_detected(
         detect([scans], out=tmp_path / "none")
 
 
-def test_scans_of_one_stem_keep_their_results_apart(detect: Detect, tmp_path: Path) -> None:
+def test_scans_of_one_stem_keep_their_results_apart(tmp_path: Path) -> None:
     scans = write_scans(tmp_path / "same", "a.bin", "below/a.bin")
     np.save(scans / "a.npy", POINTS[:100])
     detect([scans], out=tmp_path / "out", pictures=False)
     assert files(tmp_path / "out").keys() == {"a.bin.json", "a.npy.json", "below/a.json", "detections.jsonl"}
 
 
-def test_a_folder_of_other_files_is_refused_and_one_of_an_earlier_run_is_not(detect: Detect, tmp_path: Path) -> None:
+def test_a_folder_of_other_files_is_refused_and_one_of_an_earlier_run_is_not(tmp_path: Path) -> None:
     scans, out, mine = write_scans(tmp_path / "scans", "1.bin", "2.bin"), tmp_path / "out", tmp_path / "mine"
     mine.mkdir()
     for name, content in (("1.json", "mine"), ("detections.jsonl", '{"mine": 1}')):
@@ -94,9 +89,7 @@ def test_a_folder_of_other_files_is_refused_and_one_of_an_earlier_run_is_not(det
     assert len(read_lines(out)) == 1
 
 
-def test_a_run_that_was_broken_off_can_be_given_again(
-    detect: Detect, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_run_that_was_broken_off_can_be_given_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     scans, out = write_scans(tmp_path / "scans", "1.bin", "2.bin"), tmp_path / "out"
     write = ResultWriter.__call__
 
@@ -113,7 +106,7 @@ def test_a_run_that_was_broken_off_can_be_given_again(
     assert len(read_lines(out)) == 2
 
 
-def test_a_file_of_somebody_else_in_an_earlier_run_s_folder_is_kept(detect: Detect, tmp_path: Path) -> None:
+def test_a_file_of_somebody_else_in_an_earlier_run_s_folder_is_kept(tmp_path: Path) -> None:
     scans, out = write_scans(tmp_path / "scans", "0.bin", "1.bin"), tmp_path / "out"
     detect([scans / "0.bin"], out=out, pictures=False)
     for name in ("1.json", "1.txt", "1_bev.png", "1_image.png", "recording.json", "tracks.txt"):
@@ -125,7 +118,7 @@ def test_a_file_of_somebody_else_in_an_earlier_run_s_folder_is_kept(detect: Dete
         (out / name).unlink()
 
 
-def test_results_are_not_written_through_links(detect: Detect, tmp_path: Path) -> None:
+def test_results_are_not_written_through_links(tmp_path: Path) -> None:
     scans, out, elsewhere = write_scans(tmp_path / "scans", "below/1.bin"), tmp_path / "out", tmp_path / "elsewhere"
     detect([scans], out=out)
     for name in ("detections.jsonl", "below/1.json", "below/1_bev.png", "below"):
@@ -139,7 +132,7 @@ def test_results_are_not_written_through_links(detect: Detect, tmp_path: Path) -
         elsewhere.rename(out / name)
 
 
-def test_the_folder_may_be_a_link_and_scans_have_the_names_of_other_results(detect: Detect, tmp_path: Path) -> None:
+def test_the_folder_may_be_a_link_and_scans_have_the_names_of_other_results(tmp_path: Path) -> None:
     scans = write_scans(tmp_path / "scans", "recording.bin", "tracks.bin", "unreadable.bin")
     (tmp_path / "disk").mkdir()
     (tmp_path / "out").symlink_to(tmp_path / "disk")
@@ -150,7 +143,7 @@ def test_the_folder_may_be_a_link_and_scans_have_the_names_of_other_results(dete
     assert json.loads((tmp_path / "out" / "recording.json").read_text())["scan"].endswith("recording.bin")
 
 
-def test_pictures_of_other_boxes_do_not_stay(detect: Detect, tmp_path: Path) -> None:
+def test_pictures_of_other_boxes_do_not_stay(tmp_path: Path) -> None:
     split = KittiSplit(write_dataset(tmp_path / "kitti", 2))
     scans, out = split.scan_path("000000").parent, tmp_path / "out"
     detect([scans], out=out)
@@ -166,9 +159,7 @@ def test_pictures_of_other_boxes_do_not_stay(detect: Detect, tmp_path: Path) -> 
     assert files(out).keys() == left - {"000001.txt"}
 
 
-def test_what_lies_beside_a_scan_is_used_or_said(
-    detect: Detect, tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_what_lies_beside_a_scan_is_used_or_said(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     """A calibration becomes KITTI text, and with an image a picture of the boxes in it."""
     split, out = KittiSplit(write_dataset(tmp_path / "kitti", 4)), tmp_path / "out"
     split.image_path("000000").parent.mkdir()

@@ -193,10 +193,7 @@ def test_simulated_frames_are_what_detect_reads(tmp_path: Path) -> None:
     assert "view" in refusal(run_here("simulate", "other", "--view", "rear", cwd=tmp_path))
 
 
-def test_version() -> None:
+def test_the_command_is_installed_and_says_its_version() -> None:
     result = run_here("--version")
     assert result.returncode == 0 and result.stdout.strip().count(".") == 2
-
-
-def test_the_command_is_installed() -> None:
     assert shutil.which("asca", path=str(Path(sys.executable).parent))
