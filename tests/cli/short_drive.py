@@ -34,5 +34,7 @@ def read_lines(out: Path) -> list[dict[str, Any]]:
 
 
 def run(path: Path, out: Path, **options: Any) -> list[dict[str, Any]]:
-    detect([path], **({"out": out, "bundle": BUNDLE, "threads": 1} | options))
+    options.setdefault("bundle", BUNDLE)
+    options.setdefault("threads", 1)
+    detect([path], out=out, **options)
     return read_lines(out)

@@ -5,7 +5,7 @@ import signal
 import subprocess
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -89,7 +89,7 @@ def work(monkeypatch: pytest.MonkeyPatch) -> Work:
 
 
 @pytest.fixture(scope="module")
-def journal(drive: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[list[bytes]]:
+def journal(drive: Path, tmp_path_factory: pytest.TempPathFactory) -> list[bytes]:
     """The lines of a journal of all scans but the last."""
     with pytest.MonkeyPatch.context() as patch:
         left = Work(patch).killed_after(SCANS - 1, drive, tmp_path_factory.mktemp("killed") / "out", track=True)
