@@ -94,6 +94,7 @@ def test_lists_that_were_edited_are_not_written_anew(tmp_path: Path) -> None:
     simulate(tmp_path, 4, report=False)
     simulate(tmp_path, 5, report=False)
     train = tmp_path / "ImageSets" / "train.txt"
+    assert len(train.with_name("val.txt").read_text().split()) >= 2, "half of the frames"
     for edited in ("000000\n000002\n", "000001\n000000\n", "my own split\n", train.read_text() + "\n"):
         train.write_text(edited)
         with pytest.raises(OutputError, match=r"train\.txt: `asca simulate` did not write it"):
