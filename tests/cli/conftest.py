@@ -1,4 +1,4 @@
-"""Made-up scenes and predictions for `asca eval`, and a recording for `asca detect`."""
+"""Made-up scenes and predictions for `asca eval`, and a recording and a small model for `asca detect`."""
 
 from pathlib import Path
 from typing import Any
@@ -7,6 +7,7 @@ import pytest
 
 from asca_pillars.data.kitti import KittiObject, KittiSplit, write_labels
 from tests.cli.short_drive import write_drive
+from tests.deploy.conftest import write_bundle
 from tests.helpers.blank_plots import blank_plots
 from tests.helpers.scenes import write_dataset
 
@@ -32,6 +33,12 @@ def root(tmp_path: Path) -> Path:
 def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Of the tests that have rosbags."""
     return write_drive(tmp_path_factory.mktemp("drive") / "drive.mcap")
+
+
+@pytest.fixture(scope="session")
+def bundle(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A tiny one with random weights, which finds something in any scan, for tests of files and messages."""
+    return write_bundle(tmp_path_factory.mktemp("bundles") / "tiny")
 
 
 @pytest.fixture

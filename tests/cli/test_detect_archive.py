@@ -27,11 +27,6 @@ BAD = 7
 
 
 @pytest.fixture(scope="module")
-def bundle(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_bundle(tmp_path_factory.mktemp("bundles") / "tiny")
-
-
-@pytest.fixture(scope="module")
 def scans(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Forty tiny scans, one of them damaged."""
     folder = tmp_path_factory.mktemp("archive") / "scans"
@@ -84,29 +79,21 @@ def cluster(scans: Path, bundle: Path, tmp_path: Path, monkeypatch: pytest.Monke
     return made
 
 
-def test_shards_become_what_one_process_writes(cluster: Cluster, alone: bytes) -> None:
-    assert cluster.run() == alone
+def test_shards_become_what_one_process_writes_and_what_is_done_is_not_done_again(
+    cluster: Cluster, alone: bytes
+) -> None:
+    assert cluster.run() == alone and len(alone.splitlines()) == SCANS - 1
     assert [len(shard.items) for shard in cluster.begun] == [16, 16, 8]
     (line,) = cluster.unreadable.splitlines()
     assert json.loads(line)["scan"] == str(cluster.scans / f"{BAD}.bin") and "4 bytes" in json.loads(line)["error"]
-    assert len(alone.splitlines()) == SCANS - 1
-
-
-def test_what_is_done_is_not_done_again(cluster: Cluster, alone: bytes) -> None:
-    cluster.run()
     cluster.shards[1].unlink()
     (cluster.out / "detections.jsonl").unlink()
     cluster.begun.clear()
-    cluster.run()
-    assert cluster.run() == alone
+    for _ in range(2):
+        assert cluster.run() == alone
     assert [shard.first for shard in cluster.begun] == [16]
-
-
-def test_what_tells_of_the_scans_of_a_cluster_does_not_stay_beside_others(cluster: Cluster) -> None:
-    cluster.run()
-    assert cluster.unreadable
     detect([cluster.scans / "1.bin"], out=cluster.out, bundle=cluster.bundle, threads=1, pictures=False)
-    assert not (cluster.out / UNREADABLE_FILE).exists()
+    assert not (cluster.out / UNREADABLE_FILE).exists(), "it told of others"
     assert (cluster.out / "shards" / "run.json").is_file()
 
 
@@ -125,38 +112,28 @@ def test_a_folder_of_shards_that_is_a_link_or_somebody_else_s_is_left_alone(clus
     assert len(list(shards.iterdir())) == 1 and elsewhere.is_dir()
 
 
-def test_scans_of_the_same_names_below_another_folder_are_others(
-    cluster: Cluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_another_run_is_refused(cluster: Cluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of other scores or another bundle, and of scans of the same names below another folder."""
     for day in ("monday", "tuesday"):
         shutil.copytree(cluster.scans, tmp_path / day / "scans")
     monkeypatch.chdir(tmp_path / "monday")
     cluster.scans = Path("scans")
-    for _ in range(2):
-        cluster.run()
-    assert len(cluster.begun) == 3
-    monkeypatch.chdir(tmp_path / "tuesday")
-    with pytest.raises(OutputError, match=r"working_folder = .*monday, now .*tuesday; choose another folder"):
-        cluster.start()
-
-
-def test_scores_of_classes_reach_the_workers(cluster: Cluster, tmp_path: Path) -> None:
     scores = ["Cyclist=0.4", "Car=0.9"]
     for given in (scores, scores[::-1]):  # the same run
         found = cluster.run(score=given)
     assert len(cluster.begun) == 3
     with pytest.raises(ScanError, match="1 of 40"):
         detect([cluster.scans], out=tmp_path / "alone", bundle=cluster.bundle, threads=1, pictures=False, score=scores)
-    assert found == (tmp_path / "alone" / "detections.jsonl").read_bytes()
-
-
-def test_another_run_is_refused(cluster: Cluster, tmp_path: Path) -> None:
-    cluster.run()
-    with pytest.raises(OutputError, match=r"score = None, now 0\.3; choose another folder"):
+    assert found == (tmp_path / "alone" / "detections.jsonl").read_bytes(), "scores reach the workers"
+    with pytest.raises(OutputError, match=r"score = .*, now 0\.3; choose another folder"):
         cluster.start(score=["0.3"])
-    cluster.bundle = write_bundle(tmp_path / "other", uses_counts=False)
+    own, cluster.bundle = cluster.bundle, write_bundle(tmp_path / "other", uses_counts=False)
     with pytest.raises(OutputError, match="bundle_sha256 = "):
-        cluster.start()
+        cluster.start(score=scores)
+    cluster.bundle = own
+    monkeypatch.chdir(tmp_path / "tuesday")
+    with pytest.raises(OutputError, match=r"working_folder = .*monday, now .*tuesday; choose another folder"):
+        cluster.start(score=scores)
 
 
 def test_relative_paths_are_those_of_the_command(
@@ -243,20 +220,15 @@ def test_a_machine_that_is_not_set_up_alike_ends_the_run(cluster: Cluster, tmp_p
     assert not cluster.shards
 
 
-def test_options_that_do_not_go_together_are_named(cluster: Cluster) -> None:
+def test_what_cannot_be_is_refused_before_the_work(cluster: Cluster, monkeypatch: pytest.MonkeyPatch) -> None:
     for options in ({"pictures": True}, {"provider": "auto"}):
         with pytest.raises(ConfigError, match=f"--{next(iter(options))}"):
             cluster.start(**options)
-    assert not cluster.out.exists()
-
-
-def test_without_ray_it_says_what_to_install(
-    scans: Path, bundle: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    monkeypatch.undo()
     monkeypatch.setitem(extras.EXTRAS, "cluster", ("no_such_ray",))
     with pytest.raises(AscaError, match=re.escape(install_command("cluster"))):
-        detect([scans], out=tmp_path / "out", bundle=bundle, cluster="local")
-    assert not (tmp_path / "out").exists()
+        cluster.start()
+    assert not cluster.out.exists()
 
 
 def test_counts_are_those_of_the_lines(tmp_path: Path) -> None:

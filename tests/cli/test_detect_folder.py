@@ -1,6 +1,7 @@
 """`asca detect` of a folder of scans over time: tracks and files as of a recording, videos, the page of pictures."""
 
 import json
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,13 +13,15 @@ pytest.importorskip("rosbags", reason="needs pip install -e '.[recordings]'")
 
 from asca_deploy import result_files
 from asca_deploy.detect_scans import detect_scans
+from asca_deploy.open_model import RuntimeOptions
 from asca_deploy.recordings import video as recording_video
 from asca_deploy.recordings.video import recording_rate_hz
 from asca_pillars.base.errors import AscaError, ConfigError, OutputError, ScanError
 from asca_pillars.cli.detect import detect
 from asca_pillars.pictures.video import BoxVideo, is_own_video
 from asca_pillars.scans.scan_reader import write_scan
-from tests.cli.short_drive import POINTS, SCANS
+from tests.cli.short_drive import BUNDLE, POINTS, SCANS, read_lines, run, scan
+from tests.deploy.conftest import make_scan
 from tests.helpers.gallery_cards import cards, sources, title
 from tests.helpers.video_encoder import needs_encoder
 from tests.scans.recordings.cloud_recordings import stamps
@@ -28,12 +31,11 @@ from tests.scans.recordings.cloud_recordings import stamps
 def folder(tmp_path: Path) -> Path:
     """The scans of the recording `drive`."""
     for number in range(SCANS):
-        write_scan(tmp_path / "scans" / f"{number}.bin", POINTS - np.array([0.5 * number, 0, 0, 0], np.float32))
+        write_scan(tmp_path / "scans" / f"{number}.bin", scan(number))
     return tmp_path / "scans"
 
 
-def lines(out: Path) -> list[dict[str, Any]]:
-    return [json.loads(line) for line in (out / "detections.jsonl").read_text().splitlines()]
+detected = partial(detect_scans, options=RuntimeOptions(bundle=BUNDLE, threads=1))
 
 
 def frames(path: Path) -> list[np.ndarray]:
@@ -49,48 +51,49 @@ def write_times(path: Path) -> Path:
 def test_tracks_and_files_are_those_of_a_recording(folder: Path, drive: Path, tmp_path: Path) -> None:
     from mcap.reader import make_reader
 
-    messages: dict[Path, list[tuple[int, bytes]]] = {}
+    lines, messages = [], []
     for path, times in ((folder, write_times(tmp_path / "times.txt")), (drive, None)):
         foxglove = tmp_path / f"{path.stem}_boxes.mcap"
-        detect([path], out=tmp_path / f"of_{path.stem}", track=True, times=times, foxglove=foxglove, pictures=False)
+        out = tmp_path / f"of_{path.stem}"
+        lines.append(run(path, out, track=True, times=times, foxglove=foxglove, pictures=False))
         with foxglove.open("rb") as file:
-            messages[path] = [(one.log_time, one.data) for *_, one in make_reader(file).iter_messages()]
-    of_folder, of_drive = lines(tmp_path / "of_scans"), lines(tmp_path / "of_drive")
+            messages.append([(one.log_time, one.data) for *_, one in make_reader(file).iter_messages()])
+    of_folder, of_drive = lines
     assert len(of_folder) == SCANS and of_folder[0]["boxes"]
     for one, other in zip(of_folder, of_drive, strict=True):
         assert one["time_s"] == pytest.approx(other["time_s"], abs=1e-6)
         for box, same in zip(one["boxes"], other["boxes"], strict=True):
             assert box == pytest.approx(same, abs=1e-3)
     assert json.loads((tmp_path / "of_scans" / "4.json").read_text())["boxes"] == of_folder[4]["boxes"]
-    assert [time for time, _ in messages[folder]] == pytest.approx([time for time, _ in messages[drive]], abs=1000)
-    entities = json.loads(messages[folder][0][1])["entities"]
-    assert [one["id"] for one in entities] == [f"track-{box['track_id']}" for box in of_folder[0]["boxes"]]
+    times_ns = [[time for time, _ in one] for one in messages]
+    assert times_ns[0] == pytest.approx(times_ns[1], abs=1000)
+    for (_, message), line in zip(messages[0], of_folder, strict=True):
+        ids = [one["id"] for one in json.loads(message)["entities"]]
+        assert ids == [f"track-{box['track_id']}" for box in line["boxes"]]
 
 
-def test_velocities_follow_the_rate(folder: Path) -> None:
+def test_velocities_follow_the_rate_which_writes_no_time(folder: Path, tmp_path: Path) -> None:
     def speed(rate_hz: float | None) -> float:
-        found = detect_scans(folder, track=True, rate_hz=rate_hz)
+        found = detected(folder, track=True, rate_hz=rate_hz)
         tracks = found[-1].tracks
         assert tracks is not None and found[-1].detections is tracks.detections
         return float(np.median(tracks.velocities_mps[:, 0]))
 
     assert speed(None) == pytest.approx(-5, abs=1)
     assert speed(5) == pytest.approx(-2.5, abs=0.7)
-
-
-def test_without_track_nothing_changes_and_a_rate_writes_no_time(folder: Path, tmp_path: Path) -> None:
-    found = detect_scans(folder, tmp_path / "plain", pictures=False)
-    detect_scans(folder, tmp_path / "rated", pictures=False, rate_hz=5)
+    found = detected(folder, tmp_path / "plain", pictures=False)
+    detected(folder, tmp_path / "rated", pictures=False, rate_hz=5)
     assert found[0].tracks is None
-    assert lines(tmp_path / "plain") == lines(tmp_path / "rated")
-    assert "time_s" not in lines(tmp_path / "rated")[0]
+    lines = read_lines(tmp_path / "rated")
+    assert read_lines(tmp_path / "plain") == lines and "time_s" not in lines[0]
 
 
 def test_a_scan_that_cannot_be_read_keeps_its_time(folder: Path, tmp_path: Path) -> None:
     (folder / "2.bin").write_bytes(b"torn")
-    found = detect_scans(folder, tmp_path / "out", track=True, times=write_times(tmp_path / "times.txt"))
+    times = write_times(tmp_path / "times.txt")
+    found = detected(folder, tmp_path / "out", track=True, times=times, pictures=False)
     assert found.unreadable == 1 and len(found) == SCANS - 1
-    assert [line["time_ns"] for line in lines(tmp_path / "out")] == pytest.approx(
+    assert [line["time_ns"] for line in read_lines(tmp_path / "out")] == pytest.approx(
         [time_ns for number, time_ns in enumerate(stamps(SCANS)) if number != 2], abs=1000
     )
 
@@ -108,7 +111,7 @@ def test_the_video_shows_identities(folder: Path, tmp_path: Path, monkeypatch: p
     monkeypatch.setattr(BoxVideo, "draw", drawn)
     for _ in range(2):  # the second replaces the first
         shown.clear()
-        found = detect_scans(folder, track=True, rate_hz=20, video=tmp_path / "a.mp4", video_view=view)
+        found = detected(folder, track=True, rate_hz=20, video=tmp_path / "a.mp4", video_view=view)
     assert [time_s for time_s, _ in shown] == pytest.approx([0.05 * number for number in range(SCANS)])
     assert [ids for _, ids in shown] == [one.tracks.track_ids.tolist() for one in found if one.tracks is not None]
     images = frames(tmp_path / "a.mp4")
@@ -120,7 +123,7 @@ def test_the_file_for_rerun_is_one(folder: Path, tmp_path: Path) -> None:
     pytest.importorskip("rerun", reason="needs pip install -e '.[view]'")
     from asca_deploy.recordings.rerun_file import is_own_rrd
 
-    detect([folder], out=tmp_path / "out", threads=1, track=True, rerun=tmp_path / "a.rrd", pictures=False)
+    run(folder, tmp_path / "out", track=True, rerun=tmp_path / "a.rrd", pictures=False)
     assert is_own_rrd(tmp_path / "a.rrd")
 
 
@@ -157,7 +160,7 @@ def test_what_does_not_fit_is_refused_before_the_work(
 
 @needs_encoder
 def test_a_recording_becomes_a_video_of_tracks(drive: Path, tmp_path: Path) -> None:
-    detect([drive], out=tmp_path / "out", threads=1, track=True, video=tmp_path / "a.mp4")
+    run(drive, tmp_path / "out", track=True, video=tmp_path / "a.mp4")
     assert len(frames(tmp_path / "a.mp4")) == SCANS
     assert not (tmp_path / "out" / "index.html").exists()
 
@@ -169,32 +172,33 @@ def test_a_video_runs_as_fast_as_its_recording() -> None:
     assert recording_rate_hz([5, 5]) == recording_rate_hz([]) == 10
 
 
-def test_a_page_shows_the_pictures_of_a_run(folder: Path, tmp_path: Path) -> None:
-    out = tmp_path / "out"
-    detect([folder], out=out, threads=1)
+def test_a_page_shows_the_pictures_of_a_run(bundle: Path, tmp_path: Path) -> None:
+    out, scans = tmp_path / "out", tmp_path / "scans"
+    for number in range(3):
+        write_scan(scans / f"{number}.bin", make_scan(number, 300))
+    run(scans, out, bundle=bundle)
     page = (out / "index.html").read_text()
-    assert title(out / "index.html") == f"asca detect: {SCANS} scans"
-    assert list(cards(page)) == ["0", "1", "2", "3", "4"]
+    assert title(out / "index.html") == "asca detect: 3 scans"
+    assert list(cards(page)) == ["0", "1", "2"]
     assert all(one.keys() == {"boxes", "best score", "lowest score"} for one in cards(page).values())
     assert all((out / source).is_file() for source in sources(page))
-    detect([folder], out=out, threads=1, pictures=False)
+    run(scans, out, bundle=bundle, pictures=False)
     assert (out / "index.html").read_text() == page, "its pictures are of the same boxes"
-    detect([folder], out=out, threads=1, pictures=False, score=["0.9"])
+    run(scans, out, bundle=bundle, pictures=False, score=["0.99"])
     assert not (out / "index.html").exists(), "its pictures are gone"
     (out / "index.html").write_text("<h1>mine</h1>")
     with pytest.raises(OutputError, match=r"index\.html: `asca detect` did not write it"):
-        detect([folder], out=out, threads=1)
+        run(scans, out, bundle=bundle)
 
 
 def test_misses_are_counted_where_there_are_labels(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """One label on a car that is found, one where nothing is, one behind the sensor."""
     write_scan(tmp_path / "scans" / "0.bin", POINTS)
-    detect([tmp_path / "scans"], out=tmp_path / "out", threads=1, pictures=False)
-    found = json.loads((tmp_path / "out" / "0.json").read_text())["boxes"][0]
+    (line,) = run(tmp_path / "scans", tmp_path / "out", pictures=False)
     keys = ("x_m", "y_m", "z_m", "length_m", "width_m", "height_m", "yaw_rad")
-    labels = np.array([[found[key] for key in keys]] * 3, np.float32)
+    labels = np.array([[line["boxes"][0][key] for key in keys]] * 3, np.float32)
     labels[1:, :2] = (40, 25), (-20, 0)
     monkeypatch.setattr(result_files, "labels_of_scan", lambda path: labels)
-    detect([tmp_path / "scans"], out=tmp_path / "out", threads=1)
+    run(tmp_path / "scans", tmp_path / "out")
     (values,) = cards((tmp_path / "out" / "index.html").read_text()).values()
     assert values["missed"] == 1

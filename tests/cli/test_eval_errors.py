@@ -65,10 +65,10 @@ def test_boxes_without_a_camera(tmp_path: Path) -> None:
 
 def test_the_model_that_wrote_the_predictions_is_named(root: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    invoke("eval", "--data", root, "--errors", "--out", out)
-    assert list(datasets(out)) == ["default kitti/val"]
+    invoke("eval", "fast", "--data", root, "--errors", "--out", out)
+    assert list(datasets(out)) == ["fast kitti/val"]
     invoke("eval", "--data", root, "--predictions", out / "predictions", "--errors", "--out", tmp_path / "again")
-    assert list(datasets(tmp_path / "again")) == ["default kitti/val"]
+    assert list(datasets(tmp_path / "again")) == ["fast kitti/val"]
 
 
 @pytest.mark.parametrize(
@@ -81,19 +81,15 @@ def test_the_model_that_wrote_the_predictions_is_named(root: Path, tmp_path: Pat
         (("--errors", "--errors-by", "2"), "--errors-by 2: every frame id begins with 00; give a larger number"),
         (("--errors", "--beside", "none.json"), "none.json: cannot be read"),
         (("--errors", "--errors-by", "list"), "lies within val; write one for each part"),
+        (("--errors", "--predictions", "x", "--labels", "y"), "--errors looks at the points of the scans: give --data"),
     ],
 )
 def test_what_does_not_go_together(root: Path, tmp_path: Path, options: tuple[str, ...], message: str) -> None:
+    data = () if "--labels" in options else ("--data", root)
     with pytest.raises(AscaError) as caught:
-        invoke("eval", "--data", root, "--out", tmp_path / "out", *options)
+        invoke("eval", *data, "--out", tmp_path / "out", *options)
     assert message in str(caught.value) and "\n" not in str(caught.value)
     assert not (tmp_path / "out").exists()
-
-
-def test_no_scans(texts: dict[str, Any], tmp_path: Path) -> None:
-    text = "--predictions", texts["predictions"], "--labels", texts["labels"], "--out", tmp_path / "out"
-    with pytest.raises(AscaError, match="--errors looks at the points of the scans: give --data ROOT that has them"):
-        invoke("eval", *text, "--errors")
 
 
 @pytest.mark.parametrize("content", ["[]", "{", '{"subject": "x"}', '{"subject": "x", "datasets": [{}], "about": {}}'])

@@ -19,6 +19,10 @@ def test_predictions_of_somebody_else_are_not_replaced(tmp_path: Path, root: Pat
         "out: holds predictions and nothing that `asca eval` wrote; choose another folder, or empty it"
     )
     assert len(list(theirs.glob("*.txt"))) == 3
+    own = earlier_predictions(tmp_path / "own", texts["predictions"])  # labels may lie where such predictions were
+    assert "would replace" in refused(predictions=texts["predictions"], labels=own, out=tmp_path / "own")
+    assert len(list(own.iterdir())) == 4
+    evaluate(predictions=own, labels=texts["labels"], out=tmp_path / "own")
 
 
 @pytest.mark.parametrize("protocol", ["kitti", "waymo"])
@@ -49,21 +53,23 @@ FOREIGN = {
 }
 
 
-@pytest.mark.parametrize("name", FOREIGN)
 @pytest.mark.parametrize("earlier", [True, False])
-def test_a_file_of_somebody_else_is_not_replaced(
-    tmp_path: Path, texts: dict[str, Any], name: str, earlier: bool
-) -> None:
+def test_a_file_of_somebody_else_is_not_replaced(tmp_path: Path, texts: dict[str, Any], earlier: bool) -> None:
     out = tmp_path / "out"
     if earlier:  # the folder is ours, the file is not
         evaluate(**texts, out=out)
-    (out / name).parent.mkdir(parents=True, exist_ok=True)
-    (out / name).write_text(FOREIGN[name])
-    before = contents(out)
-    output = refused(**texts, out=out)
-    expected = f"{name}: `asca eval` did not write it" if earlier else "nothing that `asca eval` wrote"
-    assert expected in output, output
-    assert contents(out) == before
+    kept = contents(out)
+    for name, content in FOREIGN.items():
+        (out / name).parent.mkdir(parents=True, exist_ok=True)
+        (out / name).write_text(content)
+        before = contents(out)
+        output = refused(**texts, out=out)
+        expected = f"{name}: `asca eval` did not write it" if earlier else "nothing that `asca eval` wrote"
+        assert expected in output, output
+        assert contents(out) == before
+        (out / name).unlink()
+        if name in kept:
+            (out / name).write_bytes(kept[name])
 
 
 def refused(**arguments: Any) -> str:
@@ -104,22 +110,15 @@ def test_json_replaces_nothing_but_the_report_of_its_protocol(
         assert contents(tmp_path) == before
 
 
-def test_what_is_evaluated_is_not_removed(tmp_path: Path, texts: dict[str, Any]) -> None:
-    """Labels may lie where an earlier evaluation left the predictions of a model."""
-    out = tmp_path / "out"
-    own = earlier_predictions(out, texts["predictions"])
-    assert "would replace" in refused(predictions=texts["predictions"], labels=own, out=out)
-    assert len(list(own.iterdir())) == 4
-    evaluate(predictions=own, labels=texts["labels"], out=out)
-
-
-@pytest.mark.parametrize("name", ["report.json", "report.md", "curves.png", "predictions", "gallery"])
-def test_nothing_is_evaluated_through_links(tmp_path: Path, root: Path, texts: dict[str, Any], name: str) -> None:
-    out = tmp_path / "out"
+def test_nothing_is_evaluated_through_links(tmp_path: Path, root: Path, texts: dict[str, Any]) -> None:
+    out, elsewhere = tmp_path / "out", tmp_path / "elsewhere"
     earlier_predictions(out, texts["predictions"])
     evaluate(predictions=out / "predictions", data=root, out=out, gallery=None)
-    elsewhere = (out / name).rename(tmp_path / "elsewhere")
-    (out / name).symlink_to(elsewhere)
-    before = contents(tmp_path)
-    assert f"{name}: is a link" in refused(**texts, out=out)
-    assert contents(tmp_path) == before
+    for name in ("report.json", "report.md", "curves.png", "predictions", "gallery"):
+        (out / name).rename(elsewhere)
+        (out / name).symlink_to(elsewhere)
+        before = contents(tmp_path)
+        assert f"{name}: is a link" in refused(**texts, out=out)
+        assert contents(tmp_path) == before
+        (out / name).unlink()
+        elsewhere.rename(out / name)

@@ -53,9 +53,8 @@ def test_a_bundle_with_its_weights_gets_a_dense_neck(with_weights: Path, scans: 
 
 def test_a_bundle_written_anew_keeps_its_weights(with_weights: Path, scans: Path, tmp_path: Path) -> None:
     folder = shutil.copytree(with_weights, tmp_path / "bundle")
-    for score in (0.1, 0.2):
-        invoke("export", folder, "-o", folder, "--scans", scans, "--score", f"Car={score}")
-        assert load_pillar_bundle(folder).spec.classes[0].score_threshold == score
+    invoke("export", folder, "-o", folder, "--scans", scans, "--score", "Car=0.1")
+    assert load_pillar_bundle(folder).spec.classes[0].score_threshold == 0.1
     invoke("export", folder, "-o", folder, "--scans", scans, "--score", "0.3")
     assert {each.score_threshold for each in load_pillar_bundle(folder).spec.classes} == {0.3}
     weights, kept = (load_checkpoint(each / WEIGHTS_FILE).detector.state_dict() for each in (with_weights, folder))

@@ -8,6 +8,7 @@ import pytest
 import yaml
 
 from asca_deploy import detect_archive
+from asca_export.pv_rcnn import int8
 from asca_pillars.base.errors import ConfigError
 from asca_pillars.base.schema import to_dict
 from asca_pillars.cli.detect import detect
@@ -17,6 +18,7 @@ from asca_pillars.models.checkpoint import load_checkpoint
 from asca_pillars.scans.scan_reader import write_scan
 from asca_pillars.training.loop import train
 from tests.cli.local_cluster import Here
+from tests.cli.short_drive import read_lines
 from tests.data.boxes.box_scenes import write_box_dataset
 from tests.export.pv_rcnn.random_checkpoint import CALIBRATION, random_checkpoint
 from tests.export.tiny import SCANS
@@ -26,7 +28,7 @@ from tests.helpers.scenes import write_dataset
 from tests.models.two_stage.tiny_refine import tiny_refine_config, write_first_stage
 
 
-def test_prepare_computes_the_proposals_that_training_reads(tmp_path: Path) -> None:
+def test_prepare_computes_the_proposals_that_training_reads(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     config = tiny_refine_config(write_first_stage(tmp_path / "first.ckpt"), epochs=1)
     root, path = write_box_dataset(tmp_path / "own", 6, val_frames=2), tmp_path / "refine.yaml"
     path.write_text(yaml.safe_dump(to_dict(config)))
@@ -39,15 +41,10 @@ def test_prepare_computes_the_proposals_that_training_reads(tmp_path: Path) -> N
     assert sorted(root.rglob("proposals-*/*.npz")) == files
     assert [file.stat().st_mtime_ns for file in files] == times, "none was computed again"
 
-
-def test_inspect_runs_and_proposes_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    first = write_first_stage(tmp_path / "first.ckpt")
-    root, path = write_dataset(tmp_path / "data", 3), tmp_path / "refine.yaml"
-    path.write_text(yaml.safe_dump(to_dict(tiny_refine_config(first))))
-    inspect(root, config=path)
-    assert "against tiny_refine: 2 of 2 frames" in capsys.readouterr().out
+    inspect(write_dataset(tmp_path / "data", 3), config=path)
+    assert "against tiny_refine: 2 of 2 frames" in " ".join(capsys.readouterr().out.split())
     with pytest.raises(ConfigError, match=r"--propose .*own\.yaml: classes of model.kind pillar_refine"):
-        inspect(root, config=path, propose=tmp_path / "own.yaml")
+        inspect(tmp_path / "data", config=path, propose=tmp_path / "own.yaml")
     assert not (tmp_path / "own.yaml").exists()
 
 
@@ -58,6 +55,8 @@ def write_scans(folder: Path, scans: list[np.ndarray]) -> Path:
 
 
 def test_an_8_bit_bundle_from_export_to_evaluation(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    scores = int8._scores
+    monkeypatch.setattr(int8, "_scores", lambda pipeline, scans: scores(pipeline, scans[:1]))  # layers by one scan
     save_checkpoint(tmp_path / "last.ckpt", random_checkpoint())
     scans, bundle = write_scans(tmp_path / "scans", SCANS), tmp_path / "bundle"
     calibration = write_scans(tmp_path / "calibration", CALIBRATION)
@@ -69,20 +68,17 @@ def test_an_8_bit_bundle_from_export_to_evaluation(tmp_path: Path, monkeypatch: 
     assert "conv2_0" in exported.stdout and "blocks.0.0" in exported.stdout
     assert json.loads((bundle / "bundle.json").read_text())["precision"] == "int8"
 
-    detected = run_here("detect", scans, "--bundle", bundle, "--out", tmp_path / "out", "--threads", 1)
+    detected = run_here("detect", scans, "-b", bundle, "--out", tmp_path / "out", "--threads", 1, "--no-pictures")
     assert detected.returncode == 0, detected.stderr
     assert "cpu int8" in detected.stdout and len(list((tmp_path / "out").glob("*.json"))) == len(SCANS)
     monkeypatch.setattr(detect_archive, "run_shards", Here())
     monkeypatch.setattr(detect_archive, "require", lambda extra: None)
     detect([scans], out=tmp_path / "archive", bundle=bundle, cluster="made-up:1")
-    lines = [(tmp_path / folder / "detections.jsonl").read_text() for folder in ("out", "archive")]
-    assert lines[0] == lines[1]
+    assert read_lines(tmp_path / "out") == read_lines(tmp_path / "archive")
     monkeypatch.setattr("asca_deploy.benchmark.roofline.gemm_rate", lambda kind, threads: 100.0)
     timed = run_here("bench", scans / "0.bin", "--bundle", bundle, "--rounds", 2, "--threads", 1)
     assert timed.returncode == 0 and "voxels" in timed.stdout, timed.stderr
-    data = write_dataset(tmp_path / "data", 3, val_frames=2)
-    evaluated = run_here(
-        *("eval", bundle, "--data", data, "--out", tmp_path / "eval", "--threads", 1),
-        *("--gallery", 0, "--min-score", 0.01),
-    )
+    data = write_dataset(tmp_path / "data", 2)
+    options = ("--out", tmp_path / "eval", "--threads", 1, "--gallery", 0, "--min-score", 0.01)
+    evaluated = run_here("eval", bundle, "--data", data, *options)
     assert evaluated.returncode == 0, evaluated.stderr

@@ -26,6 +26,17 @@ from tests.helpers.tiny_run import CONFIG
 
 HEAVY = "torch lightning onnx onnxscript tensorboard sklearn scipy matplotlib openvino rosbags mcap rerun"
 WITHOUT_TORCH = hiding(HEAVY, "from asca_pillars.cli.main import main\nmain()")
+IN_TURN = hiding(
+    HEAVY,
+    """
+import contextlib
+from asca_pillars.cli.main import main
+for command in sys.argv[1:]:
+    sys.argv = ["asca", *command.split()]
+    with contextlib.suppress(SystemExit):
+        main()
+""",
+)
 
 
 def asca(*arguments: object, cwd: Path | None = None, code: str = WITHOUT_TORCH) -> subprocess.CompletedProcess:
@@ -67,57 +78,57 @@ def test_help_loads_nothing_heavy() -> None:
         assert command in result.stdout
 
 
-def test_detect_finds_boxes_in_the_sample_without_torch(tmp_path: Path) -> None:
-    result = asca("detect", cwd=tmp_path)
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows knows no limit on the size of files")
+def test_detect_finds_boxes_without_torch_and_a_full_disk_loses_none_of_them(tmp_path: Path) -> None:
+    result = asca("detect", "-b", "fast", cwd=tmp_path)
     assert result.returncode == 0, result.stderr
     assert "Car" in result.stdout and "FPS" in result.stdout and "pillarize" in result.stdout
     out = tmp_path / "detections"
-    assert {path.name for path in out.iterdir()} == {"detections.jsonl", "index.html", "street.json", "street_bev.png"}
-    boxes = json.loads((out / "street.json").read_text())["boxes"]
-    expected = Detector()(read_scan(sample_scan_path()).points)
+    before = {path.name: path.read_bytes() for path in out.iterdir()}
+    assert before.keys() == {"detections.jsonl", "index.html", "street.json", "street_bev.png"}
+    boxes = json.loads(before["street.json"])["boxes"]
+    expected = Detector("fast")(read_scan(sample_scan_path()).points)
     assert [box["class"] for box in boxes] == expected.names and len(boxes) >= 3
     assert np.asarray(cv2.imread(str(out / "street_bev.png"))).shape[1] >= 500
+    limit = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (200, 200))\n"  # a write beyond it fails
+    assert "File too large" in refusal(asca("detect", "-b", "fast", cwd=tmp_path, code=limit + WITHOUT_TORCH))
+    assert {path.name: path.read_bytes() for path in out.iterdir()} == before
 
 
-def test_doctor_names_the_missing_extras() -> None:
-    result = asca("doctor")
-    assert result.returncode == 0, result.stderr
-    assert "provider cpu: ok" in result.stdout
+def test_without_the_extras_commands_say_what_to_install(tmp_path: Path) -> None:
+    (tmp_path / "config.yaml").write_text("name: x\n")
+    commands = "doctor", "train config.yaml --data . --out run", "export last.ckpt -o bundle"
+    result = asca(*commands, cwd=tmp_path, code=IN_TURN)
+    assert "provider cpu: ok" in result.stdout and "auto takes cpu int8" in result.stdout
     assert install_command("train") in result.stdout and install_command("cluster") in result.stdout
     assert f"provider openvino is not installed: `{install_command('openvino')}`" in result.stdout
-    assert "auto takes cpu int8" in result.stdout
+    refused = result.stderr.splitlines()
+    assert len(refused) == 2 and all(install_command("train") in line for line in refused), result.stderr
 
 
-def test_detect_refuses_bad_scans_in_one_line(tmp_path: Path) -> None:
-    for name, message in (("truncated.bin", "truncated.bin: 1 byte"), ("scan.las", "unknown suffix '.las'")):
+def test_detect_refuses_in_one_line(tmp_path: Path) -> None:
+    (tmp_path / "detections").write_text("keep me")
+    for name in ("truncated.bin", "scan.las"):
         (tmp_path / name).write_bytes(b"x")
-        assert message in refusal(run_here("detect", tmp_path / name, cwd=tmp_path))
-    assert not (tmp_path / "detections").exists()
-
-
-def test_detect_refuses_what_is_not_there(tmp_path: Path) -> None:
-    assert "no such file or folder" in refusal(asca("detect", tmp_path / "none.bin"))
-    for option, value, message in (
-        ("--bundle", tmp_path, "bundle.json"),
-        ("--provider", "gpu", "unknown provider 'gpu'"),
-        ("--precision", "half", "unknown precision 'half'"),
-        ("--threads", 0, "threads"),
+    for arguments, message in (
+        (("truncated.bin", "--out", "out"), "truncated.bin: 1 byte"),
+        (("scan.las", "--out", "out"), "unknown suffix '.las'"),
+        (("none.bin", "--out", "out"), "no such file or folder"),
+        (("--bundle", tmp_path), "bundle.json"),
+        (("--provider", "gpu"), "unknown provider 'gpu'"),
+        (("--precision", "half"), "unknown precision 'half'"),
+        (("--threads", 0), "threads"),
+        (("-b", "fast"), "detections"),
     ):
-        assert message in refusal(run_here("detect", option, value, cwd=tmp_path))
+        assert message in refusal(run_here("detect", *arguments, cwd=tmp_path))
+    assert not (tmp_path / "out").exists() and (tmp_path / "detections").read_text() == "keep me"
 
 
 def test_a_scan_without_points_gives_no_boxes(tmp_path: Path) -> None:
     np.save(tmp_path / "empty.npy", np.empty((0, 4), np.float32))
-    result = run_here("detect", "empty.npy", cwd=tmp_path)
+    result = run_here("detect", "empty.npy", "-b", "fast", cwd=tmp_path)
     assert result.returncode == 0, result.stderr
     assert json.loads((tmp_path / "detections" / "empty.json").read_text())["boxes"] == []
-
-
-def test_commands_whose_extra_is_missing_say_what_to_install(tmp_path: Path) -> None:
-    (tmp_path / "config.yaml").write_text("name: x\n")
-    message = refusal(asca("train", tmp_path / "config.yaml", "--data", tmp_path, "--out", tmp_path / "run"))
-    assert install_command("train") in message
-    assert install_command("train") in refusal(asca("export", "last.ckpt", "-o", tmp_path / "bundle"))
 
 
 def test_train_refuses_typos_and_missing_data(tmp_path: Path) -> None:
@@ -169,40 +180,20 @@ def test_from_training_to_boxes(tmp_path: Path) -> None:
     assert "calibrated on 8 scans" in quantized.stdout and "logit error" in quantized.stdout.lower()
     assert json.loads((bundle / "bundle.json").read_text())["precision"] == "int8"
     assert not (bundle / "weights.ckpt").exists()
-    detected = asca("detect", scans, "--bundle", bundle, "--out", tmp_path / "out")
-    assert detected.returncode == 0, detected.stderr
-    assert len(list((tmp_path / "out").glob("*.json"))) == 8
+    detected = run_here("detect", scans, "--bundle", bundle, "--out", tmp_path / "out", "--no-pictures")
+    assert detected.returncode == 0 and len(list((tmp_path / "out").glob("*.json"))) == 8, detected.stderr
 
 
 def test_simulated_frames_are_what_detect_reads(tmp_path: Path) -> None:
     result = run_here("simulate", "sim", "-n", 2, "--view", "camera", "-w", 1, cwd=tmp_path)
     assert result.returncode == 0, result.stderr
-    detected = run_here("detect", "sim/training/velodyne", cwd=tmp_path)
+    detected = run_here("detect", "sim/training/velodyne", "-b", "fast", "--no-pictures", cwd=tmp_path)
     assert detected.returncode == 0, detected.stderr
     assert sorted(path.name for path in (tmp_path / "detections").glob("*.txt")) == ["000000.txt", "000001.txt"]
     assert "view" in refusal(run_here("simulate", "other", "--view", "rear", cwd=tmp_path))
 
 
-def test_a_file_where_the_output_folder_should_be(tmp_path: Path) -> None:
-    target = tmp_path / "detections"
-    target.write_text("keep me")
-    assert "detections" in refusal(run_here("detect", cwd=tmp_path))
-    assert target.read_text() == "keep me"
-
-
-@pytest.mark.skipif(sys.platform == "win32", reason="Windows knows no limit on the size of files")
-def test_a_full_disk_loses_nothing_that_was_there(tmp_path: Path) -> None:
-    assert run_here("detect", cwd=tmp_path).returncode == 0
-    before = {path.name: path.read_bytes() for path in (tmp_path / "detections").iterdir()}
-    limit = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (200, 200))\n"  # a write beyond it fails
-    assert "File too large" in refusal(asca("detect", cwd=tmp_path, code=limit + WITHOUT_TORCH))
-    assert {path.name: path.read_bytes() for path in (tmp_path / "detections").iterdir()} == before
-
-
-def test_version() -> None:
-    result = asca("--version")
+def test_the_command_is_installed_and_says_its_version() -> None:
+    result = run_here("--version")
     assert result.returncode == 0 and result.stdout.strip().count(".") == 2
-
-
-def test_the_command_is_installed() -> None:
     assert shutil.which("asca", path=str(Path(sys.executable).parent))

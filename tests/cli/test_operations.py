@@ -6,6 +6,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from asca_pillars.base import errors
 from asca_pillars.cli import doctor
 from asca_pillars.cli.run_command import run_command
 from asca_pillars.scans.scan_reader import write_scan
+from tests.cli.short_drive import BUNDLE, POINTS, read_lines
 from tests.helpers.in_process import run_here
 
 DEPLOY = Path(__file__).parents[2] / "docs" / "guide" / "deploy.md"
@@ -75,44 +77,38 @@ def test_a_defect_keeps_its_traceback() -> None:
 
 
 def test_a_terminal_that_knows_ascii_only_gets_the_table(tmp_path: Path) -> None:
-    done = subprocess.run(
-        [sys.executable, "-m", "asca_pillars.cli", "detect", "-o", str(tmp_path / "out")],
-        env={"PYTHONIOENCODING": "ascii", "PYTHONPATH": ":".join(sys.path), "PATH": ""},
-        capture_output=True,
-        check=False,
-    )
+    np.save(tmp_path / "near.npy", POINTS)
+    words = ["detect", str(tmp_path / "near.npy"), "-b", str(BUNDLE), "--no-pictures", "-o", str(tmp_path / "out")]
+    environment = {"PYTHONIOENCODING": "ascii", "PYTHONPATH": ":".join(sys.path), "PATH": ""}
+    command = [sys.executable, "-m", "asca_pillars.cli", *words]
+    done = subprocess.run(command, env=environment, capture_output=True, check=False)
     assert done.returncode == 0, done.stderr.decode()
     assert b"heading" in done.stdout and b"?" in done.stdout
 
 
 def test_a_scan_that_cannot_be_read_makes_a_run_partial(tmp_path: Path) -> None:
-    (tmp_path / "scans").mkdir()
-    (tmp_path / "scans" / "1.bin").write_bytes(b"torn")
-    write_scan(tmp_path / "scans" / "2.bin", np.ones((3, 4), np.float32))
-    done = run_here("detect", tmp_path / "scans", "--no-pictures", "--out", tmp_path / "out", "--write", "openpcdet")
+    scans, out = tmp_path / "scans", tmp_path / "out"
+    write_scan(scans / "2.bin", np.ones((3, 4), np.float32))
+    (scans / "1.bin").write_bytes(b"torn")
+    done = run_here("detect", scans, "-b", BUNDLE, "--no-pictures", "--out", out, "--write", "openpcdet")
     assert done.returncode == 3, done.stderr
-    assert [path.name for path in (tmp_path / "out" / "openpcdet").iterdir()] == ["2.txt"]
+    assert [path.name for path in (out / "openpcdet").iterdir()] == ["2.txt"]
+    (line,) = read_lines(out)
+    assert line["made_by"] == Detector(BUNDLE).made_by
+    assert set(line["made_by"]) == {"model", "weights_sha256", "version"}
     assert run_here("detect", tmp_path / "none.bin", cwd=tmp_path).returncode == 4
     assert run_here("detect", "--score", "Tram=1", cwd=tmp_path).returncode == 2
-    line = json.loads((tmp_path / "out" / "detections.jsonl").read_text())
-    assert line["made_by"] == Detector().made_by
-    assert set(line["made_by"]) == {"model", "weights_sha256", "version"}
 
 
-def test_doctor_as_json_says_whether_the_model_runs() -> None:
+def test_doctor_as_json_says_whether_the_model_runs(monkeypatch: pytest.MonkeyPatch) -> None:
     done = run_here("doctor", "--json")
     assert done.returncode == 0
     checks = json.loads(done.stdout)
     assert checks["model"]["ok"] and checks["model"]["made_by"]["model"] == checks["model"]["name"] == "default"
     assert checks["providers"]["cpu"] == {"ok": True, "says": "ok"}
     assert set(checks["extras"]["train"]) == {"ok", "says"}
-
-    def broken() -> dict:
-        raise errors.BundleError("damaged")
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(doctor, "_bundled_model", broken)
-        done = run_here("doctor")
+    monkeypatch.setattr(doctor, "_bundled_model", MagicMock(side_effect=errors.BundleError("damaged")))
+    done = run_here("doctor")
     assert done.returncode == 1 and "damaged" in done.stdout
 
 
