@@ -53,9 +53,14 @@ def test_a_bundle_with_its_weights_gets_a_dense_neck(with_weights: Path, scans: 
 
 def test_a_bundle_written_anew_keeps_its_weights(with_weights: Path, scans: Path, tmp_path: Path) -> None:
     folder = shutil.copytree(with_weights, tmp_path / "bundle")
-    invoke("export", folder, "-o", folder, "--scans", scans, "--score", "Car=0.1")
+    post = ("--post", "nms_iou=0.2", "--post", "vote_iou=0.6")
+    invoke("export", folder, "-o", folder, "--scans", scans, "--score", "Car=0.1", *post)
     assert load_pillar_bundle(folder).spec.classes[0].score_threshold == 0.1
     invoke("export", folder, "-o", folder, "--scans", scans, "--score", "0.3")
+    kept_post = load_pillar_bundle(folder).spec.post
+    assert (kept_post.nms_iou, kept_post.vote_iou) == (0.2, 0.6), "the bundle's, not the checkpoint's"
+    refused = run_here("export", folder, "-o", folder, "--scans", scans, "--post", "nms=0.2")
+    assert refused.returncode > 1 and "--post nms=0.2" in refused.stderr and "nms_iou" in refused.stderr
     assert {each.score_threshold for each in load_pillar_bundle(folder).spec.classes} == {0.3}
     weights, kept = (load_checkpoint(each / WEIGHTS_FILE).detector.state_dict() for each in (with_weights, folder))
     assert weights_sha256(weights) == weights_sha256(kept)
