@@ -92,9 +92,9 @@ def test_impossible_wishes_are_refused(tmp_path: Path) -> None:
         SceneConfig(cars=-1)
     with pytest.raises(ConfigError, match="lower bound comes first"):
         SceneConfig(relief_m=(2.0, 1.0))
-    heights = [{"sensor_height_m": (-2.0, -1.0)}, {"sensor_height_m": (0.0, 1.0)}]
-    others = [{"slope_x": (0.0, -0.1)}, {"box_lift_m": ((0.0, 0.03), (0.0, -0.05))}, {"clutter": (-15.0, 60.0)}]
-    for wrong in (*heights, *others, {"reach_m": 0.0}):
+    wrongs: list[dict[str, Any]] = [{"sensor_height_m": heights_m} for heights_m in ((-2.0, -1.0), (0.0, 1.0))]
+    wrongs += [{"slope_x": (0.0, -0.1)}, {"box_lift_m": ((0.0, 0.03), (0.0, -0.05))}, {"clutter": (-15.0, 60.0)}]
+    for wrong in (*wrongs, {"reach_m": 0.0}):
         with pytest.raises(ConfigError, match=next(iter(wrong))):
             SceneConfig(**wrong)  # type: ignore[arg-type]
     assert not (tmp_path / "x").exists()

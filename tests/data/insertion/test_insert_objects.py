@@ -101,7 +101,8 @@ def test_the_rest_of_the_frame_stays(root: Path, method: str) -> None:
     assert after.frame_id == before.frame_id and len(after.boxes) == len(after.labels)
     kept = {tuple(row) for row in before.points.tolist()}
     new = np.array([tuple(row) not in kept for row in after.points.tolist()])
-    within, deep = (points_in_boxes(after.points, after.boxes[count:], margin).any(axis=1) for margin in (1e-3, -1e-3))
+    held = [points_in_boxes(after.points, after.boxes[count:], margin_m) for margin_m in (1e-3, -1e-3)]
+    within, deep = (np.any(inside, axis=1) for inside in held)
     assert new.any() and within[new].all() and not deep[~new].any(), "of the frame, nothing is left in the new boxes"
 
 

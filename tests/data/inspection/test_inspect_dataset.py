@@ -66,14 +66,13 @@ def test_points_sizes_and_pillars_are_those_of_plain_loops(clean: Path) -> None:
     assert measure.points.tolist() == counts and min(counts) > 20
     assert measure.labels.tolist() == [0, 0, 1, 2]
     spec = dataclasses.replace(SPEC, limits=PillarLimits(max_pillars=5000, max_points=3))
-    points = read_scan(KittiSplit(clean).scan_path("000000")).points
-    measure, stats = measure_scan(points, points, spec), spec.pillarize(points).stats
-    assert (measure.points, measure.inside) == (stats.points, stats.points - stats.points_outside)
-    assert measure.cells == stats.pillars and measure.cut == stats.points_over_limit > 0
+    scan, stats = measure_scan(points, points, spec), spec.pillarize(points).stats
+    assert (scan.points, scan.inside) == (stats.points, stats.points - stats.points_outside)
+    assert scan.cells == stats.pillars and scan.cut == stats.points_over_limit > 0
     per_pillar = dataclasses.replace(spec, limits=PillarLimits(5000, 5000)).pillarize(points).point_counts
-    assert (measure.fullest, measure.crowded) == (per_pillar.max(), (per_pillar > 3).sum())
+    assert (scan.fullest, scan.crowded) == (per_pillar.max(), (per_pillar > 3).sum())
     few = dataclasses.replace(spec, limits=PillarLimits(max_pillars=100, max_points=3)).pillarize(points).stats
-    assert measure.cells == few.pillars + few.pillars_over_limit
+    assert scan.cells == few.pillars + few.pillars_over_limit
 
 
 ONE_ZONE = PillarModel(spec=dataclasses.replace(SPEC, grid=dataclasses.replace(GRID, zones=1)))

@@ -35,6 +35,13 @@ def ap(frames: list[EvaluatedFrame], least: float = 0.5, band: str = "all", metr
     return next(s.ap for s in iou_scores(frames, ["Car"]) if (s.metric, s.min_iou, s.band) == (metric, least, band))
 
 
+def test_what_holds_no_point_is_neither_missed_nor_false() -> None:
+    found = [(0.9, box(20)), (0.8, box(10))]
+    assert ap([frame([box(10), box(20)], found, visible=[True, False])]) == 100
+    assert ap([frame([box(10)], found)]) == 50
+    assert ap([frame([box(10)], [], visible=[False])]) is None
+
+
 def test_nuscenes_floors_and_the_first_recall_above_them() -> None:
     # One of ten found: a recall of 0.1 is not above the floor. Precision below 0.1 counts nothing.
     score = nuscenes_scores([frame([box(10 * k) for k in range(1, 11)], [(0.9, box(10))])], ["Car"])[0]

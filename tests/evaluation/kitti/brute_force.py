@@ -65,12 +65,12 @@ def things(frame: FrameObjects) -> list[Thing]:
 
 def curve(frames: list, name: str, metric: str, difficulty: str, band: Band) -> tuple[ReferenceCurve, ReferenceCurve]:
     def passes(threshold: float | None) -> list[tuple[list[float], int, int, float]]:
-        return [match(*frame, name, metric, difficulty, band, threshold) for frame in frames]
+        return [match(truths, found, name, metric, difficulty, band, threshold) for truths, found in frames]
 
     counted = sum(truth_state(gt, name, difficulty, band) == "counted" for truths, _ in frames for gt in truths)
     scores = [score for matched, *_ in passes(None) for score in matched]
     thresholds = pick_thresholds(scores, counted)
-    second = [passes(threshold) for threshold in thresholds]
+    second: Any = [passes(threshold) for threshold in thresholds]
     tp = [sum(len(one[0]) for one in each) for each in second]
     fp, fn, similarity = ([sum(one[place] for one in each) for each in second] for place in (1, 2, 3))
     rest: Any = (counted, len(scores), thresholds, tp, fp, fn)

@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from hypothesis import given, settings
@@ -65,7 +65,8 @@ def test_slow_twin(seed: int, metric: Literal["3d", "bev"]) -> None:
     for _ in range(3):
         labels = []
         for _ in range(int(rng.integers(0, 8))):
-            changes = {"occluded": int(rng.integers(0, 3)), "rotation_y": float(rng.uniform(-3, 3)), "bbox": image()}
+            hidden, turn = int(rng.integers(0, 3)), float(rng.uniform(-3, 3))
+            changes: dict[str, Any] = {"occluded": hidden, "rotation_y": turn, "bbox": image()}
             labels.append(item(str(rng.choice(KINDS)), *rng.uniform((-2, 8), (2, 12)), **changes))
         seen = []
         for o in labels * 2:

@@ -57,9 +57,11 @@ def test_what_was_packed_comes_back_and_torn_streams_are_errors() -> None:
     for unpack, packed in ((decompress_zstd, ZSTD), (decompress_zstd, UNSIZED), (decompress_lz4, LZ4)):
         assert unpack(packed) == unpack(packed, len(DATA)) == DATA
     assert decompress_bz2(BZ2) == DATA
-    for unpack, packed in ((decompress_lz4, LZ4), (decompress_bz2, BZ2), (decompress_zstd, ZSTD)):
+    torn: tuple[tuple[Callable[[bytes], bytes], bytes], ...]
+    torn = (decompress_lz4, LZ4), (decompress_bz2, BZ2), (decompress_zstd, ZSTD)
+    for read, whole in torn:
         with pytest.raises((ValueError, zstandard.ZstdError), match=r"end is missing|decompress"):
-            unpack(packed[:-8])
+            read(whole[:-8])
 
 
 @pytest.mark.parametrize("size", [len(DATA) - 1, len(DATA) + 1, 0, 2**40])

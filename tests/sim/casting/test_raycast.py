@@ -133,9 +133,9 @@ def test_clouds_and_glass_let_their_shares_through(firings: Firings) -> None:
     assert 0.6 < (stopped[:, :, 1:] == stopped[:, :, :-1]).mean() < 0.9
     corners = [[(8, 6, -1), (8, -6, -1), (8, -6, 1), (8, 6, 1)], [(9, 20, -9), (9, -20, -9), (9, -20, 9), (9, 20, 9)]]
     surface = np.array([[0.1, 0.0, 0.75], [0.5, 0.0, 0.0]])
-    hits = cast(bodies(quads(corners, surface)), 0, None, firings, seed=2)
+    rho = cast(bodies(quads(corners, surface)), 0, None, firings, seed=2).rho_m
     ahead = np.abs(np.arctan2(np.sin(firings.azimuth_rad), np.cos(firings.azimuth_rad))) < np.deg2rad(20)
-    x = (hits.rho_m * directions(firings)[..., 0])[:20, ahead]
+    x = (rho * directions(firings)[..., 0])[:20, ahead]
     assert np.isclose(x, 8).mean() == pytest.approx(0.25, abs=0.02)
     assert (np.isclose(x, 8) | np.isclose(x, 9)).all()
 
