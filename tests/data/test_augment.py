@@ -84,28 +84,22 @@ def assert_objects_kept(before: LabeledFrame, after: LabeledFrame, mirrored: boo
         assert points_in_boxes(points_of(after, index), after.boxes)[:, index].all()
 
 
-@settings(max_examples=30)
-@given(frames())
-def test_flip(frame: LabeledFrame) -> None:
-    flipped = copy.deepcopy(frame)
+@settings(max_examples=20)
+@given(frames(), st.floats(-2 * math.pi, 2 * math.pi), st.booleans(), st.floats(0.5, 2.0))
+def test_flip_rotation_and_scaling(frame: LabeledFrame, angle_rad: float, numpy_scalar: bool, factor: float) -> None:
+    flipped, turned, scaled = (copy.deepcopy(frame) for _ in range(3))
     flip_y(flipped)
     assert_objects_kept(frame, flipped, mirrored=True)
-    mirror = np.array([1, -1, 1, 1], np.float32)
-    assert np.array_equal(flipped.points, frame.points * mirror)
-    assert np.array_equal(flipped.boxes[:, :3], frame.boxes[:, :3] * mirror[:3])
-
-
-@settings(max_examples=30)
-@given(frames(), st.floats(-2 * math.pi, 2 * math.pi), st.booleans())
-def test_rotation(frame: LabeledFrame, angle_rad: float, numpy_scalar: bool) -> None:
-    turned = copy.deepcopy(frame)
+    assert np.array_equal(flipped.points, frame.points * np.array([1, -1, 1, 1], np.float32))
     rotate(turned, np.float64(angle_rad) if numpy_scalar else angle_rad)
     assert_objects_kept(frame, turned)
+    x, y = frame.points[:, :2].astype(np.float64).T
     cos, sin = math.cos(angle_rad), math.sin(angle_rad)
-    for before, after in ((frame.points, turned.points), (frame.boxes, turned.boxes)):
-        x, y = before[:, :2].astype(np.float64).T
-        np.testing.assert_allclose(after[:, :2], np.stack([cos * x - sin * y, sin * x + cos * y], 1), atol=2e-5)
-        assert np.array_equal(after[:, 2], before[:, 2])
+    np.testing.assert_allclose(turned.points[:, :2], np.stack([cos * x - sin * y, sin * x + cos * y], 1), atol=2e-5)
+    assert np.array_equal(turned.points[:, 2:], frame.points[:, 2:])
+    scale(scaled, factor)
+    assert_objects_kept(frame, scaled, factor=factor)
+    np.testing.assert_allclose(scaled.points, frame.points * [factor, factor, factor, 1], rtol=1e-6)
 
 
 @pytest.mark.parametrize("kind", [float, np.float64])
@@ -117,17 +111,7 @@ def test_half_a_turn_ends_below_pi(angle_rad: float, kind: type) -> None:
     assert -math.pi <= float(turned.boxes[0, 6]) < math.pi
 
 
-@settings(max_examples=30)
-@given(frames(), st.floats(0.5, 2.0))
-def test_scaling(frame: LabeledFrame, factor: float) -> None:
-    scaled = copy.deepcopy(frame)
-    scale(scaled, factor)
-    assert_objects_kept(frame, scaled, factor=factor)
-    np.testing.assert_allclose(scaled.points[:, :3], frame.points[:, :3] * factor, rtol=1e-6)
-    assert np.array_equal(scaled.points[:, 3], frame.points[:, 3])
-
-
-@settings(max_examples=30)
+@settings(max_examples=20)
 @given(frames(), st.integers(0, 2**32 - 1), st.floats(0, 1.5), st.floats(0, math.pi))
 def test_moved_objects(frame: LabeledFrame, seed: int, shift_m: float, turn_rad: float) -> None:
     moved = copy.deepcopy(frame)
@@ -166,22 +150,14 @@ def test_objects_in_a_crowd_do_not_collide() -> None:
     x, y = np.meshgrid([10.0, 10.9, 11.8], [-0.9, 0.0, 0.9])
     boxes = np.column_stack([x.ravel(), y.ravel(), np.tile([-0.8, 0.6, 0.6, 1.7, 0.1], (9, 1))]).astype(np.float32)
     moves = 0
-    for seed in range(20):
+    for seed in range(10):
         frame = frame_of(boxes)
         config = AugmentConfig(object_shift_m=0.5, object_rotation_rad=1.0)
         move_objects(frame, config, np.random.default_rng(seed))
         shared = bev_intersection(frame.boxes, frame.boxes)
         assert not shared[~np.eye(9, dtype=bool)].any()
         moves += int((frame.boxes != boxes).any(axis=1).sum())
-    assert 100 < moves <= 180
-
-
-def test_an_object_without_room_stays() -> None:
-    """A post in the middle of a house: wherever it is drawn to, it is inside."""
-    frame = frame_of([[10, 0, 0, 0.5, 0.5, 2, 0.3], [10, 0, 0, 60, 60, 3, 0]], [[10, 0, 0, 0.01], [14, 3, 0, 0.9]])
-    before = copy.deepcopy(frame)
-    move_objects(frame, AugmentConfig(), np.random.default_rng(0))
-    assert np.array_equal(frame.boxes, before.boxes) and np.array_equal(frame.points, before.points)
+    assert 50 < moves <= 90
 
 
 def test_points_of_overlapping_boxes_are_not_torn_off() -> None:
@@ -194,7 +170,7 @@ def test_points_of_overlapping_boxes_are_not_torn_off() -> None:
     assert_objects_kept(before, frame)
 
 
-@settings(max_examples=30)
+@settings(max_examples=20)
 @given(frames(), st.integers(0, 2**32 - 1))
 def test_augmented_objects_keep_their_points(frame: LabeledFrame, seed: int) -> None:
     points, boxes = frame.points.copy(), frame.boxes.copy()
@@ -289,38 +265,40 @@ def test_off_draws_nothing() -> None:
     assert rng.bit_generator.state == np.random.default_rng(0).bit_generator.state
 
 
-def test_each_object_has_one_gain_of_its_own() -> None:
+def test_gains_are_one_for_each_object_and_halve_as_often_as_they_double() -> None:
     before = POINTS.copy()
     found = corrupted(1, object_reflectance_gain=(0.5, 2.0))
     assert np.array_equal(POINTS, before) and np.array_equal(found[:, :3], POINTS[:, :3])
     assert np.array_equal(found[~INSIDE.any(axis=1)], POINTS[~INSIDE.any(axis=1)])
     gains = []
     for own in INSIDE.T:
-        dark = own & (POINTS[:, 3] < 0.45)  # twice as much is not cut off at 1
-        ratio = found[dark, 3] / POINTS[dark, 3]
+        lower = own & (POINTS[:, 3] < 0.45)  # twice as much is not cut off at 1
+        ratio = found[lower, 3] / POINTS[lower, 3]
         assert np.ptp(ratio) < 1e-5 and 0.5 <= ratio[0] <= 2
         gains.append(ratio[0])
     assert len(set(np.round(gains, 4))) == len(BOXES) and found[:, 3].max() <= 1
-
-
-def test_gains_halve_as_often_as_they_double() -> None:
     dark = POINTS.copy()
     dark[:, 3] = 0.1
     gains = [corrupted(s, dark, object_reflectance_gain=(0.5, 2.0))[INSIDE[:, 0], 3][0] / 0.1 for s in range(300)]
     assert np.mean(np.array(gains) > 1) == pytest.approx(0.5, abs=0.1)
 
 
-def test_jitter_has_its_standard_deviation() -> None:
+def test_jitter_has_its_standard_deviation_and_few_points_are_not_cut() -> None:
     found = corrupted(2, object_jitter_m=0.015)
     moved = INSIDE.any(axis=1)
     assert np.array_equal(found[~moved], POINTS[~moved]) and np.array_equal(found[:, 3], POINTS[:, 3])
     difference = (found - POINTS)[moved, :3]
     assert difference.std() == pytest.approx(0.015, rel=0.1) and abs(difference.mean()) < 0.002
+    few = np.concatenate([POINTS[INSIDE[:, 0]][:FEWEST_POINTS], POINTS[~INSIDE.any(axis=1)]])
+    for seed in range(20):
+        assert len(corrupted(seed, few, object_cut_probability=1.0)) == len(few)
+    nothing = corrupted(0, np.empty((0, 4), np.float32), object_cut_probability=1.0, object_jitter_m=0.1)
+    assert nothing.shape == (0, 4)
 
 
 def test_a_cut_takes_a_sector_or_rings_as_seen_from_the_sensor() -> None:
     taken = {"azimuth": 0, "elevation": 0}
-    for seed in range(40):
+    for seed in range(20):
         found = corrupted(seed, object_cut_probability=1.0)
         gone = ~np.isin(POINTS.view("V16").ravel(), np.ascontiguousarray(found).view("V16").ravel())
         assert not gone[~INSIDE.any(axis=1)].any()
@@ -339,15 +317,7 @@ def test_a_cut_takes_a_sector_or_rings_as_seen_from_the_sensor() -> None:
             assert any(clean.values())
             for name in taken:
                 taken[name] += clean[name]
-    assert min(taken.values()) > 20
-
-
-def test_an_object_of_few_points_is_not_cut() -> None:
-    few = np.concatenate([POINTS[INSIDE[:, 0]][:FEWEST_POINTS], POINTS[~INSIDE.any(axis=1)]])
-    for seed in range(20):
-        assert len(corrupted(seed, few, object_cut_probability=1.0)) == len(few)
-    nothing = corrupted(0, np.empty((0, 4), np.float32), object_cut_probability=1.0, object_jitter_m=0.1)
-    assert nothing.shape == (0, 4)
+    assert min(taken.values()) > 10
 
 
 def test_reflectance_is_lost_in_part_or_is_one_value() -> None:

@@ -28,10 +28,15 @@ def rewritten(root: Path, change: Callable[[str], str], frames: int = 4) -> Path
     return root
 
 
-def test_labels_that_are_right_pass(tmp_path: Path) -> None:
+def test_right_labels_pass_and_boxes_without_points_do_not(tmp_path: Path) -> None:
     root = rewritten(tmp_path, str)
     for name, training in (("train", True), ("val", False)):
         assert require_boxes(KittiSplit(root, name), CONFIG, training=training) == []
+    root = rewritten(tmp_path, str)
+    for path in (root / "training" / "velodyne").glob("*.bin"):
+        write_scan(path, np.array([[5.0, 0.0, 5.0, 0.1]], np.float32))
+    with pytest.raises(DatasetError, match=r"none of the boxes in 3 frames has data\.min_points = 1 points"):
+        require_boxes(KittiSplit(root, "train"), CONFIG, training=True)
 
 
 @pytest.mark.parametrize(
@@ -49,14 +54,6 @@ def test_no_box_of_any_class(change: Callable[[str], str], message: str, tmp_pat
     with pytest.raises(DatasetError, match=f"list `train` has no box of Car, Pedestrian, Cyclist: .*{message}"):
         train(CONFIG, root, tmp_path / "run")
     assert not list((tmp_path / "run").glob("*")), "nothing was begun"
-
-
-def test_boxes_without_points(tmp_path: Path) -> None:
-    root = rewritten(tmp_path, str)
-    for path in (root / "training" / "velodyne").glob("*.bin"):
-        write_scan(path, np.array([[5.0, 0.0, 5.0, 0.1]], np.float32))
-    with pytest.raises(DatasetError, match=r"none of the boxes in 3 frames has data\.min_points = 1 points"):
-        require_boxes(KittiSplit(root, "train"), CONFIG, training=True)
 
 
 def test_a_class_without_boxes_is_named(tmp_path: Path) -> None:

@@ -4,8 +4,6 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from asca_pillars.geometry.boxes import decode_boxes, encode_boxes, wrap_angle
 
@@ -66,16 +64,8 @@ def test_every_yaw_survives(anchor: np.ndarray, offset: float) -> None:
         assert_same_boxes(decode_boxes(residuals, direction, anchor, offset), boxes)
 
 
-@given(st.integers(0, 2**32 - 1))
-def test_every_box_survives(seed: int) -> None:
-    boxes = random_boxes(seed, 50)
-    for anchor in CAR_ANCHORS:
-        residuals, direction = encode_boxes(boxes, anchor)
-        assert_same_boxes(decode_boxes(residuals, direction, anchor), boxes)
-
-
-@pytest.mark.parametrize("turns", [-1.0, -0.5, 0.5, 1.0])
-def test_only_the_direction_tells_front_from_back(turns: float) -> None:
+@pytest.mark.parametrize("turns", [-1.0, -0.5, 0.0, 0.5, 1.0])
+def test_boxes_survive_and_only_the_direction_tells_front_from_back(turns: float) -> None:
     # The loss cannot see half turns of the yaw residual. Away from the bins' borders the box is the same.
     boxes = random_boxes(3, 400)
     from_border = np.abs(wrap_angle(boxes[:, 6] - math.pi / 4, math.pi))
@@ -88,14 +78,11 @@ def test_only_the_direction_tells_front_from_back(turns: float) -> None:
         assert_same_boxes(decode_boxes(residuals, 1 - direction, anchor), turned)
 
 
-def test_no_boxes() -> None:
+def test_no_boxes_and_sizes_that_stay_finite() -> None:
     none = np.empty((0, 7), np.float32)
     residuals, direction = encode_boxes(none, none)
     assert residuals.shape == (0, 7) and direction.shape == (0,)
     assert decode_boxes(residuals, direction, none).shape == (0, 7)
-
-
-def test_sizes_stay_finite() -> None:
     residuals = np.zeros((2, 7), np.float32)
     residuals[:, 3:6] = [[1000.0, 89.0, np.inf], [-1000.0, -89.0, -np.inf]]
     boxes = decode_boxes(residuals, np.zeros(2, np.int64), CAR_ANCHORS[:1])

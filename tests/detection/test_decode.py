@@ -9,7 +9,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from asca_pillars.base.errors import ConfigError
-from asca_pillars.detection.anchors import KITTI_CLASSES, make_anchors
+from asca_pillars.detection.anchors import KITTI_CLASSES, ClassSpec, make_anchors
 from asca_pillars.detection.decode import HeadMaps, PostProcess, decode, rotated_nms, vote_boxes
 from asca_pillars.geometry.boxes import decode_boxes, encode_boxes
 from asca_pillars.geometry.overlap import bev_iou
@@ -56,13 +56,13 @@ def decode_twin(maps: HeadMaps, post: PostProcess) -> list[tuple[float, int, np.
     reported = []
     for label, spec in enumerate(CLASSES):
         found = []
-        for anchor in (2 * label, 2 * label + 1):
-            for row, column in np.ndindex(HEIGHT, WIDTH):
-                logit = float(maps.scores[anchor, row, column])
-                if 1 / (1 + math.exp(-logit)) >= spec.score_threshold:
-                    residuals = maps.boxes[7 * anchor : 7 * anchor + 7, row, column]
-                    direction = maps.directions[2 * anchor : 2 * anchor + 2, row, column].argmax()
-                    found.append((logit, label, decode_boxes(residuals, direction, ANCHORS[row, column, anchor])))
+        for anchor, row, column in np.argwhere(maps.scores[2 * label : 2 * label + 2] >= -9).tolist():
+            anchor += 2 * label
+            logit = float(maps.scores[anchor, row, column])
+            if 1 / (1 + math.exp(-logit)) >= spec.score_threshold:
+                residuals = maps.boxes[7 * anchor : 7 * anchor + 7, row, column]
+                direction = maps.directions[2 * anchor : 2 * anchor + 2, row, column].argmax()
+                found.append((logit, label, decode_boxes(residuals, direction, ANCHORS[row, column, anchor])))
         found = sorted(found, key=lambda item: -item[0])[: post.candidates]
         kept: list[tuple[float, int, np.ndarray]] = []
         for item in found:
@@ -103,18 +103,20 @@ def test_equals_a_plain_loop(
     assert kinds == (np.float32, np.float32, np.int64)
 
 
-@pytest.mark.parametrize(("threshold", "reported"), [(0.0, 100), (1.0, 0)])
-def test_thresholds_of_zero_and_one(threshold: float, reported: int) -> None:
-    classes = tuple(dataclasses.replace(spec, score_threshold=threshold) for spec in CLASSES)
-    assert len(decode(quiet_maps(), ANCHORS, classes, PostProcess())) == reported
+def all_of(threshold: float) -> tuple[ClassSpec, ...]:
+    return tuple(dataclasses.replace(spec, score_threshold=threshold) for spec in CLASSES)
 
 
-def test_cells_that_a_masked_neck_never_looks_at_are_not_reported_at_threshold_zero() -> None:
-    classes = tuple(dataclasses.replace(spec, score_threshold=0.0) for spec in CLASSES)
+def test_thresholds_of_zero_and_one() -> None:
+    """Cells that a masked neck never looks at, at -10^4, are not reported at 0; 10^4 does not overflow."""
+    assert len(decode(quiet_maps(), ANCHORS, all_of(0.0), PostProcess())) == 100
+    assert len(decode(quiet_maps(), ANCHORS, all_of(1.0), PostProcess())) == 0
     maps = quiet_maps()
     maps.scores[:] = -1e4
     write(maps, 0, 5, 10, ANCHORS[5, 10, 0], -20.0)
-    assert len(decode(maps, ANCHORS, classes, PostProcess())) == 1
+    assert len(decode(maps, ANCHORS, all_of(0.0), PostProcess())) == 1
+    write(maps, 0, 20, 12, ANCHORS[20, 12, 0], 1e4)
+    assert decode(maps, ANCHORS, all_of(0.0), PostProcess()).scores[0] == 1
 
 
 def test_numbers_that_overflowed_give_no_boxes() -> None:
@@ -134,22 +136,13 @@ def test_numbers_that_overflowed_give_no_boxes() -> None:
     np.testing.assert_allclose(detections.boxes[:, 4], [160, 1.7], rtol=1e-5)
 
 
-def test_scores_do_not_overflow() -> None:
-    maps = quiet_maps()
-    classes = tuple(dataclasses.replace(spec, score_threshold=0.0) for spec in CLASSES)
-    maps.scores[:] = -1e4
-    write(maps, 0, 20, 12, ANCHORS[20, 12, 0], 1e4)
-    scores = decode(maps, ANCHORS, classes, PostProcess()).scores
-    assert scores[0] == 1 and (scores[1:] == 0).all()
-
-
 @pytest.mark.parametrize("settings", [{"nms_iou": -0.1}, {"nms_iou": 1.1}, {"candidates": 0}, {"max_detections": 0}])
 def test_impossible_settings_are_refused(settings: dict[str, float]) -> None:
     with pytest.raises(ConfigError, match=next(iter(settings))):
         PostProcess(**settings)  # type: ignore[arg-type]
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=15)
 @given(st.integers(0, 2**32 - 1), st.sampled_from([0.0, 0.1, 1.0]))
 def test_rows_of_active_cells_decode_as_maps_in_which_the_others_say_no(seed: int, share: float) -> None:
     maps, quiet = noisy_maps(seed, -1.0), quiet_maps()
@@ -157,13 +150,10 @@ def test_rows_of_active_cells_decode_as_maps_in_which_the_others_say_no(seed: in
     for part, silent in zip(maps, quiet, strict=True):
         silent.reshape(len(part), -1)[:, cells] = part.reshape(len(part), -1)[:, cells]
     rows = HeadMaps(*(np.ascontiguousarray(part.reshape(len(part), -1)[:, cells].T) for part in maps))
-    expected, found = (
-        decode(quiet, ANCHORS, CLASSES, PostProcess()),
-        decode(rows, ANCHORS, CLASSES, PostProcess(), cells),
-    )
-    np.testing.assert_array_equal(found.boxes, expected.boxes)
-    np.testing.assert_array_equal(found.scores, expected.scores)
-    np.testing.assert_array_equal(found.labels, expected.labels)
+    expected = decode(quiet, ANCHORS, CLASSES, PostProcess())
+    found = decode(rows, ANCHORS, CLASSES, PostProcess(), cells)
+    for part in ("boxes", "scores", "labels"):
+        np.testing.assert_array_equal(getattr(found, part), getattr(expected, part))
     with pytest.raises(ValueError, match="must have shapes"):
         decode(rows, ANCHORS, CLASSES, PostProcess(), np.arange(len(cells) + 1))
 
@@ -180,10 +170,10 @@ def nms_twin(boxes: np.ndarray, scores: np.ndarray, threshold: float) -> list[in
     return kept
 
 
-@settings(max_examples=30)
+@settings(max_examples=20)
 @given(
     st.integers(0, 2**32 - 1),
-    st.integers(0, 150),
+    st.integers(0, 100),
     st.sampled_from([2.0, 10.0, 40.0]),
     st.sampled_from([0.01, 0.2, 0.5, 0.8]),
     st.booleans(),

@@ -18,10 +18,15 @@ THREE = Detections(
 )
 
 
-def test_names_and_distances() -> None:
+def test_names_distances_and_plain_values() -> None:
     assert len(THREE) == 3
     assert THREE.names == ["Car", "Cyclist", "Pedestrian"]
     np.testing.assert_allclose(THREE.distances_m, [5, 10, 13])
+    first = THREE.to_dicts()[0]
+    place = {"x_m": 3.0, "y_m": -4.0, "z_m": 0.0}
+    size = {"length_m": 4.0, "width_m": 2.0, "height_m": 1.5}
+    assert first == {"class": "Car", "score": 0.9, **place, **size, "yaw_rad": 0.0}
+    assert json.loads(THREE.to_json()) == THREE.to_dicts()
 
 
 @pytest.mark.parametrize(
@@ -41,12 +46,14 @@ def test_parts(index: Any, names: list[str]) -> None:
     assert part.class_names == THREE.class_names
 
 
-def test_empty() -> None:
+def test_empty_and_arrays_of_different_lengths() -> None:
     empty = Detections.empty(("Car",))
     assert len(empty) == 0 and empty.names == list(empty) == []
     assert empty.boxes.shape == (0, 7) and empty.distances_m.shape == (0,)
     assert (empty.boxes.dtype, empty.scores.dtype, empty.labels.dtype) == (np.float32, np.float32, np.int64)
     assert len(empty[empty.scores > 0.5]) == 0
+    with pytest.raises(ValueError, match=r"\(3, 7\), \(2,\) and \(3,\)"):
+        Detections(THREE.boxes, THREE.scores[:2], THREE.labels, THREE.class_names)
 
 
 def test_one_number_is_one_detection() -> None:
@@ -58,19 +65,6 @@ def test_one_number_is_one_detection() -> None:
         THREE[3]
 
 
-def test_plain_values() -> None:
-    first = THREE.to_dicts()[0]
-    place = {"x_m": 3.0, "y_m": -4.0, "z_m": 0.0}
-    size = {"length_m": 4.0, "width_m": 2.0, "height_m": 1.5}
-    assert first == {"class": "Car", "score": 0.9, **place, **size, "yaw_rad": 0.0}
-    assert json.loads(THREE.to_json()) == THREE.to_dicts()
-
-
 def test_they_can_be_copied_and_sent_to_other_processes() -> None:
     for other in (sent(THREE), copy.deepcopy(THREE)):
         assert list(other) == [THREE[0], THREE[1], THREE[2]] and other.class_names == THREE.class_names
-
-
-def test_arrays_of_different_lengths_are_refused() -> None:
-    with pytest.raises(ValueError, match=r"\(3, 7\), \(2,\) and \(3,\)"):
-        Detections(THREE.boxes, THREE.scores[:2], THREE.labels, THREE.class_names)

@@ -30,9 +30,6 @@ def found(labels: list[int], scores: list[float]) -> Detections:
 def test_each_class_has_its_own_quota() -> None:
     kept = best_of_each_class(found([0, 0, 1, 0, 1, 1], [0.9, 0.8, 0.7, 0.6, 0.1, 0.2]), (2, 2))
     assert kept.boxes[:, 0].tolist() == [0, 1, 2, 5]
-
-
-def test_nothing_and_less_than_the_quota() -> None:
     assert len(best_of_each_class(Detections.empty(("Car", "Cyclist")), (5, 5))) == 0
     assert len(best_of_each_class(found([1], [0.1]), (5, 5))) == 1
 

@@ -25,15 +25,12 @@ def blue(path: Path) -> np.ndarray:
     return np.nonzero(np.abs(lower_left - (178, 114, 0)).max(axis=-1) < 40)[1]
 
 
-def test_a_curve_ends_at_the_highest_recall_reached(tmp_path: Path) -> None:
+def test_a_curve_ends_at_the_highest_recall_reached_and_may_be_empty(tmp_path: Path) -> None:
     """Two curves of precision 1 that reach recall 0.25 and 0.75: the second one is three times as long."""
     for name, samples in (("short", 11), ("long", 31)):
         write_curves(tmp_path / f"{name}.png", results([1.0] * samples), name)
     short, long = blue(tmp_path / "short.png"), blue(tmp_path / "long.png")
     assert len(short) > 50 and len(long) > 50
     assert np.ptp(long) > 1.5 * np.ptp(short)
-
-
-def test_curves_without_samples_and_classes_without_curves(tmp_path: Path) -> None:
     write_curves(tmp_path / "empty.png", results([]), "a title that is far too long for the picture " * 9)
     assert np.asarray(cv2.imread(str(tmp_path / "empty.png"))) is not None

@@ -63,17 +63,10 @@ def test_frames_without_a_prediction_file_are_left_out_and_named(tmp_path: Path)
     ("line", "message"),
     [
         (CAR, "det/000001.txt:3: 15 fields, but a prediction has 16; append the score at the end of the line"),
-        (
-            f"{CAR} 0.5 1",
-            "det/000001.txt:3: 17 fields; a KITTI object label has 15 and a detection 16; convert the file",
-        ),
         ("Car 0.5", "det/000001.txt:3: 2 fields; a KITTI object label has 15 and a detection 16; convert the file"),
         (f"{CAR} nan", "det/000001.txt:3: 'nan' is not a number; correct the line"),
         (f"{CAR.replace('20.00', '-inf')} 0.5", "det/000001.txt:3: '-inf' is not a number; correct the line"),
-        (
-            f"{CAR.replace('20.00', '1e308')} 0.5",
-            "det/000001.txt:3: '1e308' is too large; correct the line",
-        ),
+        (f"{CAR.replace('20.00', '1e308')} 0.5", "det/000001.txt:3: '1e308' is too large; correct the line"),
         (f"{CAR.replace('20.00', '2O.OO')} 0.5", "det/000001.txt:3: '2O.OO' is not a number; correct the line"),
     ],
 )

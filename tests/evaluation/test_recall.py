@@ -54,7 +54,7 @@ def test_labels_find_themselves(places: list[tuple[int, int, int]], yaw: float) 
             assert row == (objects, objects, 0)
 
 
-def test_frames_add_up() -> None:
+def test_frames_and_processes_add_up() -> None:
     tally = RecallTally(NAMES)
     labelled = np.array([box(10, 2), box(20, -5)], np.float32)
     tally.add(detections((CAR, box(10, 2)), (CAR, box(40, 2))), labelled, np.array([CAR, CAR]))
@@ -65,10 +65,7 @@ def test_frames_add_up() -> None:
     assert rows["Car"].recall == 0.5 and rows["Car"].false_per_frame == pytest.approx(1 / 3)
     assert rows["Cyclist"] == (0, 0, 0, 3) and math.isnan(rows["Cyclist"].recall)
     assert list(rows) == list(NAMES)
-
-
-def test_processes_add_up_their_counts() -> None:
-    """One finds 1 of 3 cars, the other one no frame with cars: a mean of their recalls would be NaN, the sum is 1/3."""
+    # One finds 1 of 3 cars, the other one no frame with cars: a mean of their recalls would be NaN, the sum is 1/3.
     first, second = RecallTally(NAMES), RecallTally(NAMES)
     cars = np.array([box(10, 2), box(20, -5), box(30, 5)], np.float32)
     first.add(detections((CAR, box(10, 2))), cars, np.array([CAR, CAR, CAR]))
@@ -83,15 +80,12 @@ def test_processes_add_up_their_counts() -> None:
         RecallTally(NAMES, first.counts[:3])
 
 
-def test_a_second_detection_of_an_object_is_false() -> None:
+def test_an_object_is_found_once_and_neighbors_share() -> None:
     car = (CAR, box(10, 2))
     assert count([car, (CAR, box(10.1, 2)), (CAR, box(10, 2.1))], [car])["Car"] == (1, 1, 2)
     # A duplicate takes no neighbor's place either: it overlaps that one by too little.
     assert count([car, car], [car, (CAR, box(14, 2))])["Car"] == (2, 1, 1)
-
-
-def test_two_neighbors_share_two_detections() -> None:
-    """The better detection takes the object it overlaps most and leaves the other one to the next."""
+    # The better detection takes the object it overlaps most and leaves the other one to the next.
     wanted = [(PEDESTRIAN, box(10.0, 0, PEDESTRIAN)), (PEDESTRIAN, box(10.2, 0, PEDESTRIAN))]
     for second_x in (10.25, 9.7):  # prefers the one that is taken; reaches only the other one
         found = [(PEDESTRIAN, box(10.2, 0, PEDESTRIAN)), (PEDESTRIAN, box(second_x, 0, PEDESTRIAN))]
@@ -115,15 +109,12 @@ def test_overlap_that_counts_as_found(label: int, shift_m: float, expected: tupl
     assert count(found, [(label, box(10, 3, label))])[NAMES[label]] == expected
 
 
-def test_half_a_turn_and_height_do_not_matter() -> None:
+def test_half_a_turn_and_height_do_not_matter_and_classes_are_apart() -> None:
     turned = box(10, 2, CAR, yaw=-math.pi)
     turned[2] += 3
     assert count([(CAR, turned)], [(CAR, box(10, 2))])["Car"] == (1, 1, 0)
     assert count([(CAR, box(10, 2, CAR, yaw=math.pi / 2))], [(CAR, box(10, 2))])["Car"] == (1, 0, 1)
-
-
-def test_classes_are_counted_apart() -> None:
-    """A pedestrian where a cyclist stands is a false pedestrian and a cyclist not found."""
+    # A pedestrian where a cyclist stands is a false pedestrian and a cyclist not found.
     place = box(10, 2, PEDESTRIAN)
     assert count([(PEDESTRIAN, place)], [(CYCLIST, place)]) == {
         "Car": (0, 0, 0),
@@ -132,7 +123,7 @@ def test_classes_are_counted_apart() -> None:
     }
 
 
-def test_ignored_boxes_excuse_one_detection_of_any_class_and_need_not_be_found() -> None:
+def test_ignored_boxes_excuse_one_detection_and_nothing_at_all() -> None:
     ignored = [(IGNORED, box(10, 2))]
     nothing = dict.fromkeys(NAMES, (0, 0, 0))
     assert count([], ignored) == nothing
@@ -141,9 +132,6 @@ def test_ignored_boxes_excuse_one_detection_of_any_class_and_need_not_be_found()
     assert count([(CYCLIST, box(10, 2))], ignored) == nothing
     assert count([(CAR, box(13, 2))], ignored) == nothing | {"Car": (0, 0, 1)}
     assert count([(CAR, box(10, 2)), (CAR, box(20, 2))], [*ignored, (CAR, box(20, 2))])["Car"] == (1, 1, 0)
-
-
-def test_nothing_at_all() -> None:
     assert RecallTally(NAMES).rows() == dict.fromkeys(NAMES, (0, 0, 0, 0))
     assert RecallTally(NAMES).rows()["Car"].false_per_frame == 0
     assert count([], []) == dict.fromkeys(NAMES, (0, 0, 0))

@@ -18,7 +18,26 @@ from asca_pillars.evaluation.waymo import (
     mean_over_classes,
     waymo_detection,
 )
-from tests.evaluation.waymo_objects import CYCLIST, NAMES, PEDESTRIAN, SIZES, VEHICLE, box, score_of
+
+NAMES = ("Vehicle", "Pedestrian", "Cyclist")
+SIZES = np.array([[4.6, 1.9, 1.7], [0.9, 0.8, 1.75], [1.8, 0.8, 1.75]])
+VEHICLE, PEDESTRIAN, CYCLIST = 0, 1, 2
+
+
+def box(x: float, y: float, label: int = VEHICLE, yaw: float = 0.0) -> list[float]:
+    return [x, y, 0.0, *SIZES[label], yaw]
+
+
+def score_of(
+    truth: WaymoTruth | list[WaymoTruth],
+    detections: Detections | list[Detections],
+    level: int = 2,
+    range_m: tuple[float, float] = EVERYWHERE,
+    name: str = "Vehicle",
+) -> WaymoScore:
+    frames = truth if isinstance(truth, list) else [truth]
+    results = waymo_detection(frames, detections if isinstance(detections, list) else [detections])
+    return next(item for item in results if (item.class_name, item.level, item.range_m) == (name, level, range_m))
 
 
 def labelled(*boxes: list[float], label: int = VEHICLE, levels: list[int] | None = None) -> WaymoTruth:
@@ -75,15 +94,12 @@ OFFICIAL = (
 )
 
 
-def test_the_datasets_own_tool() -> None:
+def test_the_datasets_own_tool_with_and_without_no_label_zones() -> None:
     results = waymo_detection(*crowded_frames(1, 12))
     figures = np.array([(item.ap, item.aph) for item in results], dtype=np.float64)
     # The tool computes in float32.
     np.testing.assert_allclose(figures, 100 * np.array(OFFICIAL).reshape(-1, 2), atol=1e-4, rtol=0)
-
-
-def test_no_label_zones_by_the_datasets_own_tool() -> None:
-    """Every third detection overlaps a no-label zone; AP and APH everywhere, for each class LEVEL_1 and LEVEL_2."""
+    # Every third detection overlaps a no-label zone; AP and APH everywhere, for each class LEVEL_1 and LEVEL_2.
     truth, detections = crowded_frames(1, 12)
     zones = [np.arange(len(found)) % 3 == 0 for found in detections]
     results = waymo_detection(truth, detections, no_label=zones)
@@ -91,14 +107,6 @@ def test_no_label_zones_by_the_datasets_own_tool() -> None:
     official = [(0.295828, 0.239746), (0.271611, 0.219966), (0.274176, 0.246180), (0.239996, 0.214582)]
     official += [(0.419987, 0.388068), (0.356773, 0.327095)]
     np.testing.assert_allclose(figures, 100 * np.array(official), atol=1e-4, rtol=0)
-
-
-def test_no_label_zones_hold_finds_but_no_false_ones() -> None:
-    truth = labelled(box(10, 0), box(20, 0))
-    detections = found((0.9, box(-10, 0)), (0.8, box(10, 0)))
-    assert waymo_detection([truth], [detections])[4].ap == pytest.approx(25)  # precision 1/2 at recall 1/2
-    zones = [np.array([True, True])]
-    assert waymo_detection([truth], [detections], no_label=zones)[4].ap == pytest.approx(50)
 
 
 def test_the_order_of_detections_does_not_matter() -> None:
@@ -118,7 +126,7 @@ def test_a_label_turned_by_exactly_pi_is_found() -> None:
     """The tool's polygon code gives one such pair of its example files an overlap of 0; its overlap is 1."""
     rng = np.random.default_rng(0)
     truth, detections = [], []
-    for _ in range(500):
+    for _ in range(150):
         there = [*rng.uniform(-60, 60, 2), 0.0, *rng.uniform(1, 6, 3), rng.uniform(-pi, pi)]
         truth.append(labelled(there))
         detections.append(found((0.9, [*there[:6], there[6] + pi])))
@@ -138,44 +146,7 @@ def test_labels_score_100_against_themselves(places: list[tuple[int, int]]) -> N
         assert (item.ap, item.aph) == expected
 
 
-@pytest.mark.parametrize(("turn", "aph"), [(pi, 0.0), (pi / 2, 50.0), (-pi / 4, 75.0), (2 * pi, 100.0), (-3 * pi, 0.0)])
-def test_heading(turn: float, aph: float) -> None:
-    """A square box matches however it is turned by quarters; only the heading tells."""
-    square = [10.0, 2.0, 0.0, 2.0, 2.0, 1.5, 0.4]
-    score = score_of(
-        labelled(square, label=PEDESTRIAN), found((0.9, [*square[:6], 0.4 + turn]), label=PEDESTRIAN), name="Pedestrian"
-    )
-    assert (score.ap, score.aph) == (pytest.approx(100), pytest.approx(aph, abs=1e-3))
-
-
-def test_precision_that_falls() -> None:
-    """Two vehicles; a find at 0.9, a false one at 0.6, at 0.3 the other find, turned by 60 degrees (accuracy 2 / 3).
-
-    Recall 1/2 with precision 1 and recall 1 with precision 2/3 (APH: (1 + 2/3) / 3 = 5/9). From recall 0 to 1/2 the
-    curve is level, from 0.55 to 1 too, and falls between 0.5 and 0.55:
-    AP = 0.5 + 0.45 * 2/3 + 0.05 * (1 + 2/3) / 2 = 0.841667; APH = 0.5 + 0.45 * 5/9 + 0.05 * (1 + 5/9) / 2 = 0.788889.
-    """
-    near, far = [10.0, 0, 0, 2, 2, 2, 0], [20.0, 0, 0, 2, 2, 2, 0]
-    turned = [20.0, 0, 0, 2, 2, 2, pi / 3]
-    truth = labelled(near, far, label=CYCLIST)
-    detections = found((0.3, turned), (0.9, near), (0.6, box(40, 9)), label=CYCLIST)
-    score = score_of(truth, detections, name="Cyclist")
-    assert score.objects == 2
-    assert score.ap == pytest.approx(84.1667, abs=1e-4)
-    assert score.aph == pytest.approx(78.8889, abs=1e-4)
-
-
-def test_small_steps_of_recall_are_trapezoids() -> None:
-    """40 vehicles, 39 found at 0.9 without a false one; the last at 0.5 with 10 false ones: precision 40 / 50.
-
-    The step from recall 39/40 to 1 is narrower than 0.05: AP = 39/40 + 1/40 * (1 + 0.8) / 2 = 0.9975.
-    """
-    places = [box(7 * (i % 8), 7 * (i // 8)) for i in range(40)]
-    scored = [(0.9, item) for item in places[1:]] + [(0.5, places[0])] + [(0.5, box(-20, 7 * i)) for i in range(10)]
-    assert score_of(labelled(*places), found(*scored)).ap == pytest.approx(99.75)
-
-
-def test_a_level_2_object_need_not_be_found_at_level_1_but_may() -> None:
+def test_level_2_and_what_holds_no_point() -> None:
     truth = labelled(box(10, 0), box(20, 0), levels=[1, 2])
     missing = found((0.9, box(10, 0)))
     assert score_of(truth, missing, 1).ap == pytest.approx(100)
@@ -186,9 +157,6 @@ def test_a_level_2_object_need_not_be_found_at_level_1_but_may() -> None:
     assert score_of(truth, both, 1).ap == score_of(truth, both, 2).ap == pytest.approx(100)
     # It counts as a find there: without the other one recall is 1 of 2.
     assert score_of(truth, found((0.9, box(20, 0))), 1).ap == pytest.approx(50)
-
-
-def test_what_holds_no_point_is_no_object() -> None:
     levels = difficulty_levels(np.array([0, 1, 5, 6, 100]))
     assert levels.tolist() == [0, 2, 2, 1, 1]
     truth = labelled(box(10, 0), box(20, 0), levels=[1, 0])
@@ -197,23 +165,7 @@ def test_what_holds_no_point_is_no_object() -> None:
     assert score_of(truth, found((0.9, box(20, 0)), (0.8, box(10, 0)))).ap == pytest.approx(50)
 
 
-def test_classes_need_different_overlaps() -> None:
-    """d further along its length l a box overlaps itself by (l - d) / (l + d): 0.7 at 0.176 l, 0.5 at l / 3."""
-    for label, share, expected in ((0, 0.17, 100), (0, 0.18, 0), (2, 0.33, 100), (2, 0.34, 0), (1, 0.33, 100)):
-        moved = (0.9, box(10 + share * SIZES[label][0], 0, label))
-        score = score_of(labelled(box(10, 0, label), label=label), found(moved, label=label), name=NAMES[label])
-        assert score.ap == pytest.approx(expected)
-    assert score_of(labelled(box(10, 0, 1), label=1), found((0.9, box(10, 0, 1)), label=2), name="Pedestrian").ap == 0
-
-
-def test_matching_looks_at_the_sum_of_overlaps() -> None:
-    """The better detection overlaps both; it leaves the object that only the other one reaches."""
-    truth = labelled(box(10, 0), box(10.4, 0))
-    detections = found((0.9, box(10.15, 0)), (0.8, box(9.55, 0)))  # by score alone the first would take object 0
-    assert score_of(truth, detections).ap == pytest.approx(100)
-
-
-def test_ranges_judge_both_sides_by_their_own_centers() -> None:
+def test_ranges_are_of_both_sides_and_frames_do_not_share() -> None:
     truth, detections = labelled(box(29.9, 0)), found((0.9, box(30.1, 0)))
     assert score_of(truth, detections).ap == pytest.approx(100)
     near, middle, far = (score_of(truth, detections, range_m=span) for span in RANGES_M[1:])
@@ -223,9 +175,6 @@ def test_ranges_judge_both_sides_by_their_own_centers() -> None:
     # Distance is 3D: 29 m ahead and 9 m up is beyond 30 m.
     high = [29.0, 0, 9.0, 4, 2, 2, 0]
     assert score_of(labelled(high), found((0.5, high)), range_m=(30.0, 50.0)).ap == pytest.approx(100)
-
-
-def test_frames_do_not_share_and_nothing_is_nothing() -> None:
     here, elsewhere = labelled(box(10, 0)), labelled()
     nothing = found()
     assert score_of([here, elsewhere], [nothing, found((0.9, box(10, 0)))]).ap == 0

@@ -32,19 +32,12 @@ def test_boxes_stand_upright_before_the_camera() -> None:
     np.testing.assert_allclose(front[:2], [20, -2 - 3.9 / 2], atol=1e-12)
 
 
-def test_classes_are_kittis_and_what_else_is_named() -> None:
+def test_classes_are_kittis_and_without_scans_all_objects_are_of_level_2() -> None:
     labels = [CAR, replace(CAR, type="Van"), replace(CAR, type="Truck"), replace(CAR, type="Forklift"), DONT_CARE]
     assert evaluated_classes(scored(labels, [])) == ("Car", "Forklift")
-    assert evaluated_classes(scored(labels, [hit(type="CYCLIST"), hit(type="truck")])) == (
-        "Car",
-        "Cyclist",
-        "Forklift",
-        "Truck",
-    )
+    found = [hit(type="CYCLIST"), hit(type="truck")]
+    assert evaluated_classes(scored(labels, found)) == ("Car", "Cyclist", "Forklift", "Truck")
     assert evaluated_classes(scored([DONT_CARE], [])) == ()
-
-
-def test_without_scans_every_object_is_level_2_and_2d_boxes_are_left_out() -> None:
     flat = hit(height_m=-1.0, width_m=-1.0, length_m=-1.0, x_m=-1000.0, y_m=-1000.0, z_m=-1000.0)
     frames = waymo_frames(scored([CAR, DONT_CARE], [hit(score=0.25), flat, hit(type="Tram")]), ("Car",), None)
     assert frames.truth[0].levels.tolist() == [2]
@@ -72,7 +65,7 @@ def test_levels_come_from_the_points_in_the_boxes(tmp_path: Path) -> None:
     assert waymo_frames(frames, names, split).truth[0].levels.tolist()[0] == 2
 
 
-def test_dont_care_areas_and_neighbors_stand_for_no_label_zones() -> None:
+def test_neighbors_stand_for_no_label_zones_and_scores_lie_within_the_cutoffs() -> None:
     van = beside(CAR, 2, type="Van")
     found = [hit(), hit(beside(CAR, 2)), hit(beside(CAR, 5)), hit(beside(CAR, 2), type="Cyclist")]
     frames = waymo_frames(scored([DONT_CARE, van], found), ("Car", "Cyclist"), None)
@@ -81,8 +74,5 @@ def test_dont_care_areas_and_neighbors_stand_for_no_label_zones() -> None:
     frames = waymo_frames(scored([van], found[:2]), ("Car", "Van"), None)
     assert frames.no_label[0].tolist() == [False, False]
     assert iou_3d(frames.detections[0].boxes, frames.truth[0].boxes)[:, 0].tolist() == pytest.approx([0, 1], abs=1e-5)
-
-
-def test_scores_beyond_the_cutoffs_are_refused() -> None:
     with pytest.raises(DatasetError, match=r"frame 0: score -3.5; Waymo's metric cuts off at 0, 0.01 .. 1: scale"):
         waymo_frames(scored([CAR], [hit(score=-3.5)]), ("Car",), None)

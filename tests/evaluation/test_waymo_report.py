@@ -29,16 +29,13 @@ def report(has_points: bool = True) -> WaymoReport:
     return WaymoReport("made up", ScoredFrames((EMPTY,), (EMPTY,), ()), scores, has_points, {"model": "none"})
 
 
-def test_the_table_has_both_levels_and_all_ranges() -> None:
+def test_the_table_has_both_levels_all_ranges_and_a_note_on_missing_points() -> None:
     table = waymo_table(report())
     assert [row[:2] for row in table.rows[:4]] == [("Car", text) for text in ("all", "0-30 m", "30-50 m", "50+ m")]
     assert table.rows[0][2:] == ("60.00", "50.00", "3") * 2
     assert table.rows[2][2:] == ("-", "-", "0") * 2
     assert table.rows[8][2:] == ("55.00", "45.00", "") * 2 and table.rows[10][2:] == ("-", "-", "") * 2
     assert len(table.rows) == 12 and {len(row) for row in table.rows} == {len(table.columns)}
-
-
-def test_missing_points_are_said() -> None:
     assert waymo_notes(report()) == []
     assert "give --data ROOT with the scans" in waymo_notes(report(has_points=False))[0]
 

@@ -39,13 +39,15 @@ def test_of_two_levels_the_one_with_more_points_each_time() -> None:
     assert np.array_equal(found, np.array(most_common_plane(points.copy(), 0.1)))
 
 
-def test_points_without_a_plane() -> None:
+def test_points_without_a_plane_and_points_in_a_line() -> None:
     line = np.linspace((0, 0, -1.7), (30, 30, -1.5), 100)
     steep = on_plane(np.random.default_rng(0), (0.5, 0, -5), 100)
     assert most_common_plane(np.zeros((0, 3)), 0.1) is None
     assert most_common_plane(line, 0.1) is None
     assert most_common_plane(steep, 0.1, max_slope=0.3) is None
     assert most_common_plane(steep, 0.1) == pytest.approx((0.5, 0, -5), abs=0.02)
+    assert _least_squares(*np.linspace((0, 0, 1), (3, 5, 2), 9).T) is None
+    assert _least_squares(*np.zeros((3, 2))) is None
 
 
 @given(SLOPES, SLOPES, st.floats(-3, 1), st.integers(3, 60))
@@ -57,8 +59,3 @@ def test_the_plane_of_least_squares_is_numpys(a: float, b: float, c: float, coun
     assert found is not None
     np.testing.assert_allclose(found, expected, atol=1e-8)
     np.testing.assert_allclose(plane_heights(found, points), design @ expected, atol=1e-8)
-
-
-def test_least_squares_of_points_in_a_line() -> None:
-    assert _least_squares(*np.linspace((0, 0, 1), (3, 5, 2), 9).T) is None
-    assert _least_squares(*np.zeros((3, 2))) is None

@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
@@ -17,6 +17,7 @@ def change(angle: float, shift: tuple[float, ...], mirror: bool) -> FrameChange:
     return FrameChange(axes, np.array(shift))
 
 
+@settings(max_examples=40)
 @given(angles, shifts, st.booleans(), st.integers(0, 2**32 - 1))
 def test_boxes_move_with_their_corners_and_points_and_back(
     angle: float, shift: tuple[float, ...], mirror: bool, seed: int

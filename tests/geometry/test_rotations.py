@@ -20,19 +20,17 @@ quaternions = st.tuples(*[st.floats(-2, 2)] * 4)
 angles = st.tuples(*[st.floats(-7, 7)] * 3)
 
 
-@given(st.lists(quaternions, min_size=1, max_size=4))
-def test_quaternions_of_any_length_and_direction(drawn: list[tuple[float, ...]]) -> None:
-    assume(all(np.linalg.norm(one) > 1e-3 for one in drawn))
-    expected = Rotation.from_quat(np.array(drawn)[:, [1, 2, 3, 0]]).as_matrix()  # scipy has the real part last
-    np.testing.assert_allclose(rotations_from_quaternions(np.array(drawn)), expected, atol=1e-12)
-    np.testing.assert_allclose(rotations_from_quaternions(np.array(drawn[0])), expected[0], atol=1e-12)
-
-
-@given(st.lists(angles, min_size=1, max_size=4))
-def test_roll_comes_first_and_yaw_last_about_axes_that_stand_still(drawn: list[tuple[float, ...]]) -> None:
-    expected = Rotation.from_euler("xyz", np.array(drawn)).as_matrix()
-    np.testing.assert_allclose(rotations_from_roll_pitch_yaw(np.array(drawn)), expected, atol=1e-12)
-    np.testing.assert_allclose(rotations_from_roll_pitch_yaw(np.array(drawn[0])), expected[0], atol=1e-12)
+@given(st.lists(quaternions, min_size=1, max_size=4), st.lists(angles, min_size=1, max_size=4))
+def test_quaternions_have_the_real_part_first_and_roll_comes_before_yaw(
+    quaternions: list[tuple[float, ...]], angles: list[tuple[float, ...]]
+) -> None:
+    """Of any length; about axes that stand still."""
+    assume(all(np.linalg.norm(one) > 1e-3 for one in quaternions))
+    turned = Rotation.from_quat(np.array(quaternions)[:, [1, 2, 3, 0]]), Rotation.from_euler("xyz", np.array(angles))
+    ours = rotations_from_quaternions, rotations_from_roll_pitch_yaw
+    for function, drawn, expected in zip(ours, (quaternions, angles), turned, strict=True):
+        np.testing.assert_allclose(function(np.array(drawn)), expected.as_matrix(), atol=1e-12)
+        np.testing.assert_allclose(function(np.array(drawn[0])), expected.as_matrix()[0], atol=1e-12)
 
 
 @pytest.mark.parametrize("quaternion", [(0, 0, 0, 0), (np.nan, 0, 0, 1), (np.inf, 0, 0, 1), (1e200, 0, 0, 1e200)])

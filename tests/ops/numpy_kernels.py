@@ -15,8 +15,6 @@ from asca_pillars.ops.pillar.grid import PillarGrid
 from asca_pillars.ops.pillar.prepare import FEATURES, evenly_spaced_mask
 from asca_pillars.ops.points.sampling import Columns, cells_of
 
-_NMS_BLOCK = 64
-
 
 def by_numpy(function: Callable[..., Any], *arguments: Any) -> Any:
     """The function's result with the kernels of this file."""
@@ -52,47 +50,27 @@ def _fill_pillars(
         order: the points inside, sorted by pillar; `cells` (Q,) and `counts` (Q,) describe the pillars.
         kept: (Q,) which pillars stay.
     """
-    pillar_of_point = np.repeat(np.arange(len(cells)), counts)
-    stays = kept[pillar_of_point]
-    starts = np.cumsum(counts) - counts
-    stays &= evenly_spaced_mask(np.arange(len(order)) - starts[pillar_of_point], counts[pillar_of_point], max_points)
-
-    point_counts = np.minimum(counts[kept], max_points)
-    features = _features(points.take(order[stays], axis=0), point_counts, grid.cell_centers_m(cells[kept]))
-    return features, np.repeat(np.arange(len(point_counts)), point_counts), point_counts
-
-
-def _features(
-    points: NDArray[np.float32], counts: NDArray[np.int64], centers_m: NDArray[np.float32]
-) -> NDArray[np.float32]:
-    """Points sorted by pillar (M, 4), points per pillar (P,) and pillar centers (P, 2) -> (M, 9)."""
+    ranks = np.arange(len(order)) - np.repeat(np.cumsum(counts) - counts, counts)
+    stays = np.repeat(kept, counts) & evenly_spaced_mask(ranks, np.repeat(counts, counts), max_points)
+    points, counts = points.take(order[stays], axis=0), np.minimum(counts[kept], max_points)
+    index = np.repeat(np.arange(len(counts)), counts)
     features = np.empty((len(points), len(FEATURES)), np.float32)
-    pillar_index = np.repeat(np.arange(len(counts)), counts)
     features[:, :4] = points
     for axis in range(3):
         # bincount sums in float64 and in order, so the mean does not depend on the machine.
-        means = np.bincount(pillar_index, weights=points[:, axis], minlength=len(counts)) / counts
-        features[:, 4 + axis] = points[:, axis] - np.repeat(means.astype(np.float32), counts)
-    for axis in range(2):
-        features[:, 7 + axis] = points[:, axis] - np.repeat(centers_m[:, axis], counts)
-    return features
+        means = np.bincount(index, weights=points[:, axis], minlength=len(counts)) / counts
+        features[:, 4 + axis] = points[:, axis] - means.astype(np.float32)[index]
+    features[:, 7:] = points[:, :2] - grid.cell_centers_m(cells[kept])[index]
+    return features, index, counts
 
 
 def _nms(boxes: NDArray[np.float64], iou_threshold: float, limit: int) -> NDArray[np.int64]:
     """`rotated_nms` of boxes that come best first."""
-    waiting = np.arange(len(boxes))
-    kept = [waiting[:0]]
-    while len(waiting) and sum(map(len, kept)) < limit:
-        block, waiting = waiting[:_NMS_BLOCK], waiting[_NMS_BLOCK:]
-        clashes = bev_iou(boxes[block], boxes[block]) > iou_threshold
-        alive = np.ones(len(block), bool)
-        for index, row in enumerate(clashes):
-            if alive[index]:
-                alive[index + 1 :] &= ~row[index + 1 :]
-        kept.append(block[alive])
-        clashes = bev_iou(boxes[block[alive]], boxes[waiting]) > iou_threshold
-        waiting = waiting[~clashes.any(axis=0)]
-    return np.concatenate(kept)[:limit]
+    waiting, kept = np.arange(len(boxes)), np.empty(0, np.int64)
+    while len(waiting) and len(kept) < limit:
+        kept, waiting = np.append(kept, waiting[0]), waiting[1:]
+        waiting = waiting[bev_iou(boxes[kept[-1:]], boxes[waiting])[0] <= iou_threshold]
+    return kept
 
 
 def _sort(

@@ -26,13 +26,10 @@ def names(*paths: Path) -> list[str]:
     return [scan.name.as_posix() for scan in name_scans(paths)]
 
 
-def test_scans_of_a_folder_stand_in_natural_order(tmp_path: Path) -> None:
+def test_scans_stand_in_natural_order_and_links_are_followed_but_not_in_circles(tmp_path: Path) -> None:
     touch(tmp_path, "10.bin", "2.bin", "b.npy", "9.pcd", "A1.PLY", "notes.txt", ".hidden.bin", ".cache/1.bin")
     assert [path.name for path in find_scans(tmp_path)] == ["2.bin", "9.pcd", "10.bin", "A1.PLY", "b.npy"]
     assert find_scans(str(tmp_path / "2.bin")) == [tmp_path / "2.bin"]
-
-
-def test_links_to_folders_are_followed_but_not_in_circles(tmp_path: Path) -> None:
     real = touch(tmp_path / "real", "b/1.bin", "b/2.bin")
     scans = touch(tmp_path / "scans", "a/1.bin")
     (scans / "b").symlink_to(real / "b")

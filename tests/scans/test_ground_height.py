@@ -47,19 +47,19 @@ def test_ruts_are_not_below_the_ground(deeper_m: float, below: bool) -> None:
     assert plane.share_below == pytest.approx(0.25 if below else 0.0, abs=0.02)
 
 
-def test_points_on_a_line_are_no_ground() -> None:
+def test_heights_go_along_the_axes_and_points_on_a_line_are_no_ground() -> None:
     line = np.linspace((-16, -11.7, -1.7), (16, 11.9, -1.7), 4000)
     assert fit_ground_plane(line) is None
     with pytest.raises(ScanError, match="too few points near the sensor, or all on one line"):
         estimate_height([line])
-
-
-def test_the_height_is_estimated_along_the_axes() -> None:
     points = sloped(1.2)
     points[:, 1:3] *= -1
     mounting, estimate = measured_mounting([points], Mounting(axes="x,-y,-z"))
     assert mounting == Mounting(sensor_height_m=estimate.height_m, axes="x,-y,-z")
     assert estimate.height_m == pytest.approx(1.2, abs=0.03)
+    scans = iter([NamedPoints(str(number), sloped(1.7, seed=number)) for number in range(4)])
+    assert estimate_named_height(scans, enough=2).scans == 2
+    assert next(scans).name == "2"
 
 
 @pytest.mark.parametrize(
@@ -96,9 +96,3 @@ def test_a_scan_without_ground_is_left_out_and_named(garage: NDArray[np.float32]
         assert f"from 2 scans, which agree within {estimate.spread_m:.2f} m" in str(estimate)
         assert str(estimate).endswith(f"; left out: {left_out}")
         assert estimate_height([points for _, points in scans]).left_out[0].startswith(f"scan {place + 1}: ")
-
-
-def test_no_more_scans_are_read_than_needed() -> None:
-    scans = iter([NamedPoints(str(number), sloped(1.7, seed=number)) for number in range(4)])
-    assert estimate_named_height(scans, enough=2).scans == 2
-    assert next(scans).name == "2"

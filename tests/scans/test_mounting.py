@@ -48,12 +48,9 @@ def test_the_ground_comes_where_the_model_expects_it(height: float, trained: flo
     assert Mounting(sensor_height_m=height).to_model(trained).points(ground)[0, 2] == pytest.approx(-trained, abs=1e-5)
 
 
-def test_without_a_height_nothing_is_lifted() -> None:
+def test_poses_lift_and_turn_and_without_a_height_nothing_is_lifted() -> None:
     assert Mounting().to_model(1.7).is_identity
     assert Mounting(sensor_height_m=1.2).to_model(None).is_identity  # nobody knows how high the model's was
-
-
-def test_a_pose_lifts_and_turns_and_may_be_an_array() -> None:
     pose = ((0.0, 1.0, 0.0, 2.0), (-1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 1.0, 1.84), (0.0, 0.0, 0.0, 1.0))
     mounting = Mounting(sensor_height_m=0.0, pose=np.array(pose))  # type: ignore[arg-type]  # what NumPy's users have
     np.testing.assert_allclose(mounting.level.points(POINT)[0, :3], [5 + 2, -3, -1 + 1.84], atol=1e-6)
@@ -89,14 +86,11 @@ def test_what_cannot_be_is_refused(settings: dict, message: str) -> None:
         Mounting(**settings)
 
 
-def test_from_a_config_and_back() -> None:
+def test_pose_files_and_configs_and_back(tmp_path: Path) -> None:
     mounting = parse(Mounting, {"sensor_height_m": 1.2, "axes": "y-forward"}, "here")
     assert parse(Mounting, to_dict(mounting), "there") == mounting
     with pytest.raises(ConfigError, match="did you mean `axes`"):
         parse(Mounting, {"axis": "y-forward"}, "here")
-
-
-def test_a_pose_file(tmp_path: Path) -> None:
     path = tmp_path / "pose.txt"
     np.savetxt(path, np.eye(4))
     assert Mounting(pose=read_pose(path)).level.is_identity

@@ -18,7 +18,7 @@ from asca_pillars.scans.find_scans import SCAN_SUFFIXES
 from asca_pillars.scans.ply import MAX_LISTS
 from asca_pillars.scans.scan_reader import decide_scale, read_scan, write_scan
 from asca_pillars.scans.stored_scans import folder_reflectance_scale
-from tests.scans.scan_files import POINTS, literal_lzf, npy, pcd, ply, read
+from tests.scans.scan_files import POINTS, npy, pcd, ply, read
 
 FILES = {
     "a.bin": POINTS.astype("<f4").tobytes(),
@@ -204,11 +204,18 @@ def test_a_header_that_claims_too_much_costs_no_memory(tmp_path, name, content):
         read(tmp_path, name, content.replace(b"strip 2", b"strip 1000000000000").replace(b"COUNT 3", b"COUNT 9999999"))
 
 
-def test_a_path_without_a_readable_file(tmp_path):
+def test_files_without_a_reader_or_too_large_for_memory(tmp_path, monkeypatch) -> None:
     (tmp_path / "folder.bin").mkdir()
     for name in ("missing.bin", "folder.bin"):
         with pytest.raises(ScanError, match=rf"{name}: cannot be read"):
             read_scan(tmp_path / name)
+
+    def too_little(*_: object, **__: object) -> None:
+        raise MemoryError
+
+    monkeypatch.setattr(np, "fromfile", too_little)
+    with pytest.raises(ScanError, match="64 bytes do not fit into memory"):
+        read(tmp_path, "a.bin", POINTS.tobytes())
 
 
 # --- writing and finding
@@ -268,14 +275,6 @@ def test_bombs_are_refused_at_once(tmp_path, name, content, words):
     assert time.process_time() - start < 10  # a minute and more before; no bar on speed
 
 
-def test_an_lzf_stream_is_followed_no_further_than_the_points_need(tmp_path):
-    header = pcd("binary_compressed").partition(b"DATA binary_compressed\n")
-    stream = literal_lzf(bytes(108)) + b"\xe0\xff\x00" * 1_000_000  # 264 bytes each
-    content = b"".join([*header[:2], struct.pack("<2I", len(stream), 108), stream])
-    with pytest.raises(ScanError, match=r"\d{3} or more bytes instead of 108"):
-        read(tmp_path, "a.pcd", content)
-
-
 def test_a_feather_file_that_unpacks_to_gigabytes_is_refused_before_it_is_read(tmp_path):
     feather, pyarrow = pytest.importorskip("pyarrow.feather"), pytest.importorskip("pyarrow")
     columns = dict.fromkeys(("x", "y", "z", "intensity"), np.zeros(2**23 + 1, np.uint8))
@@ -292,15 +291,6 @@ def test_files_with_too_many_points_are_refused_before_they_are_read(tmp_path, m
     monkeypatch.setattr(scan_reader, "MAX_POINTS", 3)
     with pytest.raises(ScanError, match="more than 3 points"):
         read(tmp_path, "b.bin", POINTS.tobytes())
-
-
-def test_a_file_that_does_not_fit_into_memory_is_an_error_of_one_line(tmp_path, monkeypatch):
-    def too_little(*_: object, **__: object) -> None:
-        raise MemoryError
-
-    monkeypatch.setattr(np, "fromfile", too_little)
-    with pytest.raises(ScanError, match="64 bytes do not fit into memory"):
-        read(tmp_path, "a.bin", POINTS.tobytes())
 
 
 # --- shifted columns
@@ -322,13 +312,16 @@ def test_a_line_with_a_value_too_few_or_too_many_shifts_nothing(tmp_path, name, 
 # --- the scale of reflectance
 
 
-def test_one_bright_point_does_not_darken_a_scan(tmp_path):
+def test_bright_points_scales_and_masked_points(tmp_path) -> None:
     points = STREET.copy()
     points[5, 3] = 1.02
     for name, content in (("a.bin", points.tobytes()), ("a.npy", npy(points)), ("a.pcd", pcd("binary", points))):
         scan = read(tmp_path, name, content)
         np.testing.assert_allclose(scan.points[:, 3], np.minimum(points[:, 3], 1))
         assert (scan.notes.reflectance_scale, scan.notes.clipped_reflectances) == (1, 1)
+    stored = points_from_array(np.ma.masked_greater(POINTS, 30))
+    np.testing.assert_array_equal(stored.xyz, np.delete(POINTS[:, :3], 1, axis=0))
+    assert stored.remarks == ("1 masked points left out",)
 
 
 def scaled(brightness: float) -> bytes:
@@ -419,9 +412,3 @@ def test_python_says_nothing_of_a_damaged_npy_header(tmp_path):
 def test_arrays_on_their_side_or_of_other_things_than_real_numbers_are_refused(array, words):
     with pytest.raises(ScanError, match=words):
         points_from_array(array)
-
-
-def test_masked_points_are_left_out_and_counted():
-    stored = points_from_array(np.ma.masked_greater(POINTS, 30))
-    np.testing.assert_array_equal(stored.xyz, np.delete(POINTS[:, :3], 1, axis=0))
-    assert stored.remarks == ("1 masked points left out",)

@@ -8,15 +8,12 @@ from asca_pillars.base.errors import ConfigError, ScanError
 from asca_pillars.scans.scan_times import require_one_folder, scan_times_ns
 
 
-def test_times_by_a_rate_begin_at_0() -> None:
+def test_times_by_a_rate_begin_at_0_and_those_of_a_file_are_its_seconds(tmp_path: Path) -> None:
     assert scan_times_ns(3) == [0, 100_000_000, 200_000_000]
     assert scan_times_ns(3, 20.0) == [0, 50_000_000, 100_000_000]
     for rate_hz in (0.0, -1.0, float("nan"), 1e4):
         with pytest.raises(ConfigError, match=r"--rate .*: give scans per second"):
             scan_times_ns(3, rate_hz)
-
-
-def test_times_of_a_file_are_its_seconds(tmp_path: Path) -> None:
     path = tmp_path / "times.txt"
     path.write_text("0\n1.036e-01\n\n1700000000.25\n")  # as KITTI's odometry writes them, and a clock's
     assert scan_times_ns(3, times=path) == [0, 103_600_000, 1_700_000_000_250_000_000]
@@ -41,14 +38,11 @@ def test_files_that_list_no_times_are_refused(tmp_path: Path, text: str, message
         scan_times_ns(3, times=tmp_path / "times.txt")
 
 
-def test_what_is_no_text_is_refused(tmp_path: Path) -> None:
+def test_what_is_no_text_and_scans_of_several_folders_are_refused(tmp_path: Path) -> None:
     (tmp_path / "times.txt").write_bytes(b"\xff\xfe0")
     for path, message in ((tmp_path / "times.txt", "is no text"), (tmp_path / "none.txt", "none.txt: ")):
         with pytest.raises(ScanError, match=message):
             scan_times_ns(3, times=path)
-
-
-def test_scans_over_time_lie_in_one_folder() -> None:
     require_one_folder([Path("a/1.bin"), Path("a/2.bin")])
     with pytest.raises(ConfigError, match="a and b: "):
         require_one_folder([Path("a/1.bin"), Path("b/1.bin")])

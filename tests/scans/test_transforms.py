@@ -43,7 +43,7 @@ def tree(*transforms: tuple[str, str, NDArray[np.float64]]) -> Transforms:
     return found
 
 
-def test_a_sensor_in_the_vehicles_frame() -> None:
+def test_frames_along_the_tree_and_frames_that_nothing_connects() -> None:
     roof, lidar, camera = placed((0, 0, 1.5), 0, 0, 90), placed((1, 0, 0.2), 0, 10, 0), placed((2, 0, 1))
     transforms = tree(("base_link", "roof", roof), ("/roof", "/lidar", lidar), ("base_link", "camera", camera))
     for source, target, expected in (
@@ -55,15 +55,9 @@ def test_a_sensor_in_the_vehicles_frame() -> None:
         pose = transforms.between(source, target)
         assert pose is not None and pose == pytest.approx(np.asarray(expected))
     assert transforms.frames == ["base_link", "camera", "lidar", "roof"]
-
-
-def test_frames_that_nothing_connects_and_frames_in_a_circle() -> None:
     assert Transforms().between("lidar", "base_link") is None
     shifted = placed((1, 0, 0))
     assert tree(("a", "b", shifted), ("b", "a", shifted)).between("a", "base_link") is None
-
-
-def test_the_latest_transform_counts_and_one_that_is_no_rotation_is_left_out() -> None:
     transforms = tree(("base_link", "lidar", placed((1, 0, 0))), ("base_link", "lidar", placed((5, 0, 0))))
     broken = transform_message("base_link", "lidar", placed((7, 0, 0)))
     broken.transforms[0].transform.rotation.w = 0.0

@@ -34,13 +34,10 @@ def test_the_share_of_visible_rays_is_the_occlusion_state(visible: int, state: i
     assert (label.type, label.occluded, label.truncated) == ("Car", state, 0.0)
 
 
-def test_what_is_hardly_visible_or_hit_is_dont_care() -> None:
+def test_what_is_hardly_visible_is_dont_care_and_what_is_hidden_has_no_label() -> None:
     assert [o.type for o in labels_of(20.0, 0.0, 100, 2, 50)] == ["DontCare"]
     assert [o.type for o in labels_of(90.0, 0.0, 40, 40, 0)] == ["DontCare"]
     assert [o.type for o in labels_of(60.0, 0.0, 40, 40, 2)] == ["Car"]
-
-
-def test_what_is_hidden_or_outside_the_image_has_no_label() -> None:
     assert labels_of(20.0, 0.0, 100, 0, 0) == []
     assert labels_of(-20.0, 0.0, 100, 100, 50) == []
 
@@ -55,21 +52,15 @@ def test_a_car_at_the_border_is_truncated_and_unknown_when_hardly_in_it() -> Non
     assert 3 in states.values()
 
 
-def test_all_around_what_returns_a_point_is_labelled_wherever_it_stands() -> None:
+def test_all_around_whatever_returns_a_point_is_labelled() -> None:
     for x, y in ((20.0, 0.0), (-20.0, 3.0), (2.0, -15.0), (0.5, 9.0)):
         (label,) = labels_of(x, y, 100, 70, 50, label_all_around)
         assert (label.type, label.occluded) == ("Car", 1)
         assert label.bbox == (-1, -1, -1, -1) if x < 5 else label.bbox[2] > label.bbox[0]
         assert label.truncated == (-1 if x < 5 else 0)
     assert labels_of(-20.0, 3.0, 100, 0, 0, label_all_around) == []
-
-
-def test_all_around_what_hardly_returns_anything_is_unknown_and_no_dont_care() -> None:
     (one_point,) = labels_of(-60.0, 0.0, 40, 40, 1, label_all_around)
     (hidden,) = labels_of(-20.0, 0.0, 100, 3, 3, label_all_around)
     assert [(o.type, o.occluded) for o in (one_point, hidden)] == [("Car", 3)] * 2
-
-
-def test_all_around_an_object_in_the_image_is_cut_by_its_border() -> None:
     cut = [labels_of(5.0, y, 100, 100, 50, label_all_around)[0].truncated for y in (2.0, 4.0, 5.0)]
     assert 0 <= cut[0] < cut[1] < cut[2] <= 1

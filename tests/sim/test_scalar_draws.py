@@ -34,13 +34,10 @@ def test_every_number_is_numpy_s(seed: list[int], low: float, high: float, weigh
         assert draw(ours) == draw(numpys)
 
 
-def test_an_item_is_given_back_as_it_is() -> None:
+def test_items_are_given_back_and_what_numpy_refuses_is_refused() -> None:
     item = object()
     assert draws_of(0).choice([item]) is item
     assert type(draws_of(0).uniform(0.0, 1.0)) is float
-
-
-def test_what_numpy_refuses_is_refused() -> None:
     with pytest.raises(ValueError, match="high - low"):
         draws_of(0).uniform(1.0, 0.0)
     with pytest.raises(ValueError, match="empty"):

@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,12 +22,12 @@ CAMERA = SimulationConfig(field_of_view="camera")
 
 @pytest.fixture(scope="module")
 def frames() -> list[Frame]:
-    return [simulate_frame(0, index, CAMERA) for index in range(40)]
+    return [simulate_frame(0, index, CAMERA) for index in range(24)]
 
 
 @pytest.fixture(scope="module")
 def whole() -> list[Frame]:
-    return [simulate_frame(0, index) for index in range(4)]
+    return [simulate_frame(0, index) for index in range(2)]
 
 
 def files(root: Path) -> dict[str, bytes]:
@@ -34,10 +35,10 @@ def files(root: Path) -> dict[str, bytes]:
 
 
 def test_the_number_of_workers_does_not_change_a_byte(tmp_path: Path) -> None:
-    simulate(tmp_path / "one", 5, seed=3, workers=1, config=CAMERA, val_share=0.4)
-    simulate(tmp_path / "two", 5, seed=3, workers=2, config=CAMERA, val_share=0.4)
+    simulate(tmp_path / "one", 3, seed=3, workers=1, config=CAMERA, val_share=0.4)
+    simulate(tmp_path / "two", 3, seed=3, workers=2, config=CAMERA, val_share=0.4)
     one, two = files(tmp_path / "one"), files(tmp_path / "two")
-    assert len(one) == 5 * 3 + 3  # and two lists, and what was simulated
+    assert len(one) == 3 * 3 + 3  # and two lists, and what was simulated
     assert one == two
 
 
@@ -91,14 +92,9 @@ def test_impossible_wishes_are_refused(tmp_path: Path) -> None:
         SceneConfig(cars=-1)
     with pytest.raises(ConfigError, match="lower bound comes first"):
         SceneConfig(relief_m=(2.0, 1.0))
-    for wrong in (
-        {"sensor_height_m": (-2.0, -1.0)},
-        {"sensor_height_m": (0.0, 1.0)},
-        {"slope_x": (0.0, -0.1)},
-        {"box_lift_m": ((0.0, 0.03), (0.0, -0.05))},
-        {"clutter": (-15.0, 60.0)},
-        {"reach_m": 0.0},
-    ):
+    wrongs: list[dict[str, Any]] = [{"sensor_height_m": heights_m} for heights_m in ((-2.0, -1.0), (0.0, 1.0))]
+    wrongs += [{"slope_x": (0.0, -0.1)}, {"box_lift_m": ((0.0, 0.03), (0.0, -0.05))}, {"clutter": (-15.0, 60.0)}]
+    for wrong in (*wrongs, {"reach_m": 0.0}):
         with pytest.raises(ConfigError, match=next(iter(wrong))):
             SceneConfig(**wrong)  # type: ignore[arg-type]
     assert not (tmp_path / "x").exists()
@@ -121,12 +117,9 @@ def test_written_frames_read_back_as_simulated(tmp_path: Path) -> None:
         np.testing.assert_allclose(split.calibration(name).p2, frame.calibration.p2, rtol=1e-9)
 
 
-def test_seeds_and_frames_differ() -> None:
-    sizes = {len(simulate_frame(seed, index, CAMERA).points) for seed in (0, 1) for index in (0, 1)}
-    assert len(sizes) == 4
-
-
 def test_points_are_those_of_the_sensor(whole: list[Frame]) -> None:
+    seeds = [simulate_frame(seed, 0, CAMERA).points for seed in (1, 2)]
+    assert len({len(points) for points in (*seeds, *(frame.points for frame in whole))}) == 4, "seeds and frames differ"
     for frame in whole:
         points = frame.points
         assert points.dtype == np.float32
@@ -162,7 +155,7 @@ def test_points_on_a_free_car_lie_in_its_box_and_the_box_fits(frames: list[Frame
             inside = points_in_boxes(near, box[None], margin_m=0.05)[:, 0]
             shares.append(inside.mean())
             gaps.append(box[2] + box[5] / 2 - near[inside, 2].max())
-    assert len(shares) > 10
+    assert len(shares) > 5
     assert np.mean(shares) > 0.95
     assert 0.03 < np.median(gaps) < 0.20  # KITTI: the highest return is 11 cm below the top of the box
 
@@ -197,7 +190,7 @@ def test_fully_visible_objects_hold_more_points_than_hidden_ones(frames: list[Fr
 def test_nothing_stands_in_anything_else() -> None:
     config = SceneConfig()
     placed = 0
-    for index in range(25):
+    for index in range(12):
         scene = draw_scene(config, np.random.default_rng(index))
         boxes = np.array([target.box for target in scene.targets]).reshape(-1, 7)
         placed += len(boxes)
@@ -212,32 +205,24 @@ def test_nothing_stands_in_anything_else() -> None:
         lift = [target.lift_m for target in scene.targets]  # boxes stand a little above or below the ground
         np.testing.assert_allclose(boxes[:, 2] - boxes[:, 5] / 2 - lift, ground, atol=1e-9)
         assert np.abs(lift).max(initial=0.0) <= 0.15
-    assert placed > 200
+    assert placed > 100
 
 
 def test_the_shares_of_the_configuration_are_kept() -> None:
-    people_only = SceneConfig(
-        cars=0,
-        beyond=0,
-        vans=0,
-        trucks=0,
-        trams=0,
-        misc=0,
-        cyclists=0,
-        sitting=0,
-        empty_share=0,
-        pedestrian_uniform_heading=1,
-    )
+    others = ("cars", "beyond", "vans", "trucks", "trams", "misc", "cyclists", "sitting")
+    none: dict[str, Any] = dict.fromkeys(others, 0)
+    people_only = SceneConfig(**none, empty_share=0, pedestrian_uniform_heading=1)
     yaws, count = [], 0
-    for index in range(60):
+    for index in range(40):
         scene = draw_scene(people_only, np.random.default_rng(index))
         assert {target.type for target in scene.targets} <= {"Pedestrian"}
         yaws += [target.box[6] for target in scene.targets]
         count += len(scene.targets)
-    assert count / 60 == pytest.approx(2 * people_only.pedestrians, rel=0.45)
+    assert count / 40 == pytest.approx(2 * people_only.pedestrians, rel=0.45)
     quarter = np.histogram(yaws, np.linspace(-np.pi, np.pi, 5))[0] / len(yaws)
     assert (quarter > 0.15).all()
-    assert all(not draw_scene(SceneConfig(empty_share=1.0), np.random.default_rng(i)).targets for i in range(3))
+    empty = draw_scene(SceneConfig(empty_share=1.0), np.random.default_rng(0))
+    assert not empty.targets and len(empty.background.triangles) > 2000, "but never bare"
 
 
 def test_statistics_are_near_to_those_of_kitti(frames: list[Frame]) -> None:
@@ -282,7 +267,7 @@ def test_around_is_the_whole_scan_with_labels_in_every_direction(whole: list[Fra
         rich = targets[points_in_boxes(around.points, targets).sum(axis=0) > 20]
         for x, y in rich[:, :2]:
             assert np.hypot(boxes[:, 0] - x, boxes[:, 1] - y).min() < 0.05
-    assert behind > 10
+    assert behind > 5
 
 
 def test_a_set_labelled_all_around_says_so_and_reads_back_for_training(tmp_path: Path) -> None:

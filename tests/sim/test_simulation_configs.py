@@ -20,12 +20,7 @@ def test_configs_that_ship_load_and_simulate(path: Path) -> None:
     assert len(frame.points) > 500
 
 
-def test_models_and_scenes_are_not_mixed_up() -> None:
-    assert SHIPPED and set(shipped_configs(KIND)) == {path.stem for path in SHIPPED}
-    assert not set(shipped_configs(KIND)) & set(shipped_configs())
-
-
-def test_a_file_holds_what_differs_and_the_view_wins(tmp_path: Path) -> None:
+def test_files_hold_what_differs_and_kinds_are_not_mixed_up(tmp_path: Path) -> None:
     assert load_simulation_config(None) == SimulationConfig()
     path = tmp_path / "mine.yaml"
     path.write_text("field_of_view: camera\nscene: {cars: 1.5, sensor_height_m: [2.0, 2.1]}\n")
@@ -33,6 +28,12 @@ def test_a_file_holds_what_differs_and_the_view_wins(tmp_path: Path) -> None:
     assert (config.field_of_view, config.scene.cars, config.scene.sensor_height_m) == ("camera", 1.5, (2.0, 2.1))
     assert config.lidar == SimulationConfig().lidar and config.scene.vans == SimulationConfig().scene.vans
     assert load_simulation_config(str(path), "full").field_of_view == "full"
+    with pytest.raises(ConfigError, match=r"these ship: .*residential"):
+        load_simulation_config("resident")
+    with pytest.raises(ConfigError, match="--view: `field_of_view` = 'rear'"):
+        load_simulation_config(None, "rear")
+    assert SHIPPED and set(shipped_configs(KIND)) == {path.stem for path in SHIPPED}
+    assert not set(shipped_configs(KIND)) & set(shipped_configs())
 
 
 @pytest.mark.parametrize(
@@ -53,10 +54,3 @@ def test_mistakes_are_told_in_one_line(tmp_path: Path, text: str, told: str) -> 
     with pytest.raises(ConfigError, match=told) as caught:
         load_simulation_config(str(path))
     assert str(caught.value).startswith(str(path)) and "\n" not in str(caught.value)
-
-
-def test_unknown_names_and_views() -> None:
-    with pytest.raises(ConfigError, match=r"these ship: .*residential"):
-        load_simulation_config("resident")
-    with pytest.raises(ConfigError, match="--view: `field_of_view` = 'rear'"):
-        load_simulation_config(None, "rear")

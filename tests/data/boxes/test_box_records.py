@@ -46,12 +46,15 @@ def test_the_examples_of_the_documentation_are_what_they_say(tmp_path: Path) -> 
         assert frame.records.boxes[0].tolist() == pytest.approx([12.1, -3.0, -0.7, 2.5, 1.2, 2.1, 0.3])
 
 
-def test_scores_tracks_and_time_stamps_are_kept(tmp_path: Path) -> None:
+def test_scores_tracks_and_times_are_kept_and_csv_rows_gathered_by_scan(tmp_path: Path) -> None:
     records = records_from(ARRAY, ["Car"], [0.25], ["7"])
     path = write(tmp_path / "d.jsonl", json_line("b/c.pcd", records, 12.25) + json_line("b.bin", records))
     frames = list(read_frames(path))
     assert [(frame.scan, frame.time_s) for frame in frames] == [("b/c.pcd", 12.25), ("b.bin", None)]
     assert frames[0].records.track_ids == ("7",) and frames[0].records.scores.tolist() == [0.25]
+    rows = [f"{scan},Car,{x},0,0,4,2,1.5,0" for x, scan in enumerate("abab")]
+    path = write(tmp_path / "labels.csv", "\n".join(["scan,class,x,y,z,length,width,height,yaw", *rows]))
+    assert {frame.scan: frame.records.boxes[:, 0].tolist() for frame in read_frames(path)} == {"a": [0, 2], "b": [1, 3]}
 
 
 @pytest.mark.parametrize("time_s", ["1" + "0" * 400, "1e999", "NaN", '"7"', "true"])
@@ -78,12 +81,6 @@ def test_what_is_written_is_read_again(tmp_path_factory: pytest.TempPathFactory,
     assert np.abs(next(read_frames(path)).records.boxes - box).max() < 1e-4
 
 
-def test_csv_rows_are_gathered_by_scan(tmp_path: Path) -> None:
-    rows = [f"{scan},Car,{x},0,0,4,2,1.5,0" for x, scan in enumerate("abab")]
-    path = write(tmp_path / "labels.csv", "\n".join(["scan,class,x,y,z,length,width,height,yaw", *rows]))
-    assert {frame.scan: frame.records.boxes[:, 0].tolist() for frame in read_frames(path)} == {"a": [0, 2], "b": [1, 3]}
-
-
 def with_box(**changes: object) -> str:
     return json.dumps({"scan": "a", "boxes": [BOX | changes]})
 
@@ -93,11 +90,9 @@ def with_box(**changes: object) -> str:
     [
         ("l.jsonl", '{"scan": "a", "boxes": []}\n{"scan"', r"l\.jsonl:2: not valid JSON"),
         ("l.jsonl", '{"boxes": []}', r'l\.jsonl:1: no "scan"'),
-        ("l.jsonl", "[1]", r'l\.jsonl:1: no "scan"'),
         ("l.jsonl", '{"scan": "a"}', r'l\.jsonl:1: no list "boxes"'),
         ("l.jsonl", '{"scan": "a", "boxes": [7]}', r"l\.jsonl:1, box 1: 7 is no record"),
         ("l.jsonl", json.dumps({"scan": "a", "boxes": [BOX, BOX | {"x_m": "far"}]}), r"1, box 2: x_m is 'far'"),
-        ("l.jsonl", with_box(x_m=1e9), r"box 1: x_m is '1000000000.0'"),
         ("l.jsonl", with_box(x_m=True), r"box 1: x_m is 'True'"),
         ("l.jsonl", with_box(x_m=10**400), r"box 1: x_m is '1000"),
         ("l.jsonl", with_box(score=-(10**400)), r"box 1: score is '-1000"),
@@ -114,7 +109,7 @@ def with_box(**changes: object) -> str:
         ("l.csv", "scan,class,x,x_m\na,Car,1,9\n", r"l\.csv:2: both `x` and `x_m`; remove one"),
         ("l.txt", "", r"l\.txt: labels of several frames are \.jsonl or \.csv"),
     ],
-    ids=range(22),
+    ids=range(20),
 )
 def test_a_mistake_is_named(tmp_path: Path, name: str, text: str, message: str) -> None:
     with pytest.raises(DatasetError, match=message):

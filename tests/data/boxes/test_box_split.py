@@ -18,14 +18,13 @@ from asca_pillars.data.frames import read_frame
 from asca_pillars.data.insertion.insert_objects import insert_objects, prepare_inserter
 from asca_pillars.data.inspection.findings import Finding, findings
 from asca_pillars.data.inspection.inspect_dataset import inspect_dataset
-from asca_pillars.data.kitti import KittiSplit
 from asca_pillars.data.open_split import open_split
 from asca_pillars.data.training_frames import open_frames
 from asca_pillars.detection.anchors import ClassSpec
 from asca_pillars.scans.mounting import Mounting
 from asca_pillars.scans.scan_reader import read_scan, write_scan
 from tests.data.boxes.box_scenes import write_box_dataset
-from tests.helpers.scenes import SPEC, make_scene, write_dataset
+from tests.helpers.scenes import SPEC, make_scene
 
 CLASSES = (SPEC.classes[0], ClassSpec("Forklift", 0.8, 0.6, 1.73, -0.87, 0.35, 0.2))
 CONFIG = Config(model=PillarModel(spec=replace(SPEC, classes=CLASSES)), data=DataConfig(workers=0))
@@ -36,19 +35,19 @@ def root(tmp_path: Path) -> Path:
     return write_box_dataset(tmp_path / "own", 4)
 
 
-def test_the_layout_tells_the_reader(root: Path, tmp_path: Path) -> None:
-    assert isinstance(open_split(root), BoxSplit)
-    assert isinstance(open_split(write_dataset(tmp_path / "kitti", 1)), KittiSplit)
-
-
-def test_a_frame_holds_its_points_and_boxes(root: Path) -> None:
+def test_a_frame_holds_its_points_and_boxes_all_around(root: Path) -> None:
     split = open_split(root, "train")
-    assert split.frame_ids == ("000000", "000001", "000002")
+    assert isinstance(split, BoxSplit) and split.frame_ids == ("000000", "000001", "000002")
     points, boxes, _ = make_scene(1, ("Car", "Pedestrian"))
     frame = read_frame(split, "000001", ("Forklift",))  # camera_view is on: without a camera there is nothing to cut
     assert np.array_equal(frame.points, points)
     assert frame.labels.tolist() == [0] and np.abs(frame.boxes - boxes[1:]).max() < 1e-4
     assert split.label_types("000001") == ["Car", "Forklift"]
+    # Straight behind: rounded to float32, half a turn is more than half a turn.
+    split, behind = BoxSplit(root), np.array([[-5, 0, 0, 0.1]], np.float32)
+    assert split.in_labeled_view("000000", behind).all()
+    write_scan(split.scan_path("000000"), behind)
+    assert len(split.points("000000", camera_view=True)) == 1
 
 
 def test_a_scale_left_open_is_part_of_what_points_depend_on(root: Path) -> None:
@@ -152,14 +151,6 @@ def test_inspection_notices_axes_that_lie_otherwise(root: Path) -> None:
     assert [finding.about for finding in found()] == [finding.about for finding in right]
 
 
-def test_labels_all_around_leave_nothing_out(root: Path) -> None:
-    """Straight behind: rounded to float32, half a turn is more than half a turn."""
-    split, behind = BoxSplit(root), np.array([[-5, 0, 0, 0.1]], np.float32)
-    assert split.in_labeled_view("000000", behind).all()
-    write_scan(split.scan_path("000000"), behind)
-    assert len(split.points("000000", camera_view=True)) == 1
-
-
 # --- which scans are frames, and what is said of labels without one
 
 
@@ -220,15 +211,13 @@ def test_wrong_labels_are_named(root: Path, text: str, message: str) -> None:
         frame_ids(root, name="train")
 
 
-@pytest.mark.parametrize(
-    ("name", "text", "message"),
-    [
+def test_a_wrong_file_of_labels_is_named(root: Path) -> None:
+    (root / "labels").mkdir()
+    for name, text, message in (
         ("9.json", '{"boxes": []}', r"9\.json: belongs to one scan .* there is none"),
         ("000000.txt", "10.0 1.0 -1.0 4.1 1.7 1.5 1.2 Car\n", r"000000\.txt is text: .*--from openpcdet"),
-    ],
-)
-def test_a_wrong_file_of_labels_is_named(root: Path, name: str, text: str, message: str) -> None:
-    (root / "labels").mkdir()
-    (root / "labels" / name).write_text(text)
-    with pytest.raises(DatasetError, match=message):
-        frame_ids(root, "labels: labels\n")
+    ):
+        (root / "labels" / name).write_text(text)
+        with pytest.raises(DatasetError, match=message):
+            frame_ids(root, "labels: labels\n")
+        (root / "labels" / name).unlink()

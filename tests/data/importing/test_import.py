@@ -13,11 +13,7 @@ from asca_pillars.geometry.boxes import points_in_boxes
 from asca_pillars.scans.find_scans import find_scans
 from asca_pillars.scans.scan_reader import read_scan
 from tests.data.boxes.box_scenes import write_box_dataset
-from tests.data.importing.foreign_datasets import (
-    in_sensor,
-    write_argoverse2,
-    write_nuscenes,
-)
+from tests.data.importing.foreign_datasets import in_sensor, write_argoverse2, write_nuscenes
 from tests.helpers.in_process import invoke
 
 
@@ -86,11 +82,8 @@ def test_classes_by_other_names(tmp_path: Path) -> None:
     source = (own / "labels.jsonl", tmp_path / "out", "--scans", own / "scans")
     assert "boxes: Truck 8" in invoke("import", *source, "--rename", "Forklift=Truck", "--rename", "Car=Truck")
     assert "Big one 4" in invoke("import", *source, "--rename", "Car= Big\n one", "--rename", "Forklift=Truck")
-    for text, message in (
-        ("Bus=Truck", "no box has that class; there are Car, Forklift"),
-        ("Car", "write OLD=NEW"),
-        ("Car= ", "the new name is ' ', no name"),
-    ):
+    wrong = ("Bus=Truck", "no box has that class; there are Car, Forklift"), ("Car", "write OLD=NEW")
+    for text, message in (*wrong, ("Car= ", "the new name is ' ', no name")):
         with pytest.raises(ConfigError, match=message):
             invoke("import", *source, "--rename", text)
 

@@ -48,7 +48,7 @@ def read(source: Path, tool: str) -> Imported:
 
 @pytest.mark.parametrize("tool", TOOLS)
 @given(frames=st.lists(FRAME, min_size=1, max_size=3))
-@settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=8, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_what_is_written_is_read_again_to_the_last_digit(
     tool: str, frames: list[list], tmp_path_factory: pytest.TempPathFactory
 ) -> None:

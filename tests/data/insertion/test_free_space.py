@@ -41,6 +41,13 @@ def along_rays(ground: np.ndarray, start: float, end: float) -> np.ndarray:
 def test_ground_is_free_where_it_is_seen_and_nothing_stands() -> None:
     space = find_free_space(cast(LEVEL, BOXES))
     free = middles(space)
+    assert len(free) > 5000
+    assert np.abs(np.arctan2(free[:, 1], free[:, 0])).max() < AZIMUTHS_RAD.max() + 0.05, "nothing beside the view"
+    assert not space.is_free(np.array([[-5.0, 0.0], [1e6, 0.0], [10.0, 30.0]])).any()
+    clusters = polygons(space.clusters)
+    assert len(clusters) == len(BOXES)
+    for outline in polygons(BOXES):
+        assert sum(outline.intersects(cluster) for cluster in clusters) == 1
     # The lowest returns of a side may pass for ground: its own cell, no more, may be free.
     outlines = [outline.buffer(-CELL_M) for outline in polygons(BOXES)]
     assert not any(outline.contains(Point(xy)) for xy in free for outline in outlines)
@@ -58,28 +65,13 @@ def test_ground_is_free_where_it_is_seen_and_nothing_stands() -> None:
     assert len(clear) > 1000 and space.is_free(clear).mean() > 0.97
 
 
-def test_what_is_beside_the_view_is_not_free() -> None:
-    space = find_free_space(cast(LEVEL, BOXES))
-    free = middles(space)
-    assert len(free) > 5000
-    assert np.abs(np.arctan2(free[:, 1], free[:, 0])).max() < AZIMUTHS_RAD.max() + 0.05
-    assert not space.is_free(np.array([[-5.0, 0.0], [1e6, 0.0], [10.0, 30.0]])).any()
-
-
 @pytest.mark.parametrize(("slope", "some"), [(0.03, True), (0.12, False)])
 def test_steep_ground_is_not_free(slope: float, some: bool) -> None:
     space = find_free_space(cast((0.0, slope, -1.73), BOXES[:0]))
     assert space.ground is not None and space.free.any() == some
 
 
-def test_every_object_is_in_a_cluster_of_its_own() -> None:
-    clusters = polygons(find_free_space(cast(LEVEL, BOXES)).clusters)
-    assert len(clusters) == len(BOXES)
-    for outline in polygons(BOXES):
-        assert sum(outline.intersects(cluster) for cluster in clusters) == 1
-
-
-def test_rectangles_are_the_smallest_as_shapely_finds_them() -> None:
+def test_rectangles_are_the_smallest_and_two_walls_do_not_take_the_yard() -> None:
     points = cast(LEVEL, BOXES)
     ground = fit_ground(points)
     assert ground is not None
@@ -91,10 +83,7 @@ def test_rectangles_are_the_smallest_as_shapely_finds_them() -> None:
         smallest = MultiPoint(standing[own, :2]).minimum_rotated_rectangle
         assert box[3] * box[4] == pytest.approx(smallest.area, rel=0.01, abs=0.01)
         assert box[2] - box[5] / 2 == pytest.approx(LEVEL[2], abs=0.1)
-
-
-def test_two_walls_that_meet_do_not_take_the_yard() -> None:
-    """A cluster of 20 m by 20 m; its one rectangle would hold everything in the corner."""
+    # A cluster of 20 m by 20 m; its one rectangle would hold everything in the corner.
     walls = np.array([[30.0, 0.0, -0.5, 0.3, 20.0, 2.5, 0.0], [20.0, -10.0, -0.5, 20.0, 0.3, 2.5, 0.0]], np.float32)
     space = find_free_space(cast(LEVEL, walls))
     assert space.clusters[:, 3:5].max() < 8
@@ -118,13 +107,10 @@ def test_nothing_is_free_without_ground(points: np.ndarray) -> None:
     assert not space.is_free(np.zeros((3, 2))).any()
 
 
-def test_every_azimuth_is_as_wide_as_another() -> None:
+def test_azimuths_are_equally_wide_and_cells_agree_with_lookups() -> None:
     """Straight ahead, where the angle changes its sign, too."""
     angle = np.radians(np.arange(-180, 180, 0.1) + 0.05)
     assert (np.bincount(_azimuth_bin(np.cos(angle), np.sin(angle))) == 4).all()
-
-
-def test_cells_agree_with_lookups() -> None:
     space = find_free_space(street(3)[0])
     assert len(middles(space)) == space.free.sum() > 0 and space.is_free(middles(space)).all()
     x, y = middles(space).T

@@ -20,7 +20,7 @@ from tests.data.insertion.simple_streets import cast, stand
 SLOPES = st.floats(-0.06, 0.06)
 
 
-@settings(max_examples=10)
+@settings(max_examples=6)
 @given(SLOPES, SLOPES, st.floats(-2.2, -1.4), st.integers(0, 9))
 def test_a_tilted_plane_is_found_between_walls_and_among_clutter(a: float, b: float, c: float, seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -74,7 +74,7 @@ CELL_M = 0.25
 GROUND = Ground(np.array([0.01, -0.02, -1.7]), np.array([-40.0, -40.0]), np.zeros((80, 80), np.float16))
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=60)
 @given(st.integers(0, 200), st.floats(1, 8), st.integers(0, 10_000))
 def test_labels_are_those_of_dbscan(count: int, size_m: float, seed: int) -> None:
     """From lone points to one cluster; cores are told apart exactly, a point between two clusters may be of either."""
@@ -97,26 +97,19 @@ def test_labels_are_those_of_dbscan(count: int, size_m: float, seed: int) -> Non
         assert of_cell[cell] in of_cell[cores][near]
 
 
-def test_boxes_hold_their_clusters_and_stand_on_the_ground() -> None:
+def test_clusters_stand_on_the_ground_and_long_ones_are_cut() -> None:
     rng = np.random.default_rng(1)
     middles = np.array([[10.0, 3.0], [15.0, -8.0], [-20.0, 1.0]])
-    points = np.concatenate(
-        [np.column_stack([rng.uniform(-1, 1, (200, 2)) + m, rng.uniform(-1, 0.5, 200)]) for m in middles]
-    )
+    clouds = [np.column_stack([rng.uniform(-1, 1, (200, 2)) + m, rng.uniform(-1, 0.5, 200)]) for m in middles]
+    points = np.concatenate(clouds)
     boxes = cluster_boxes(np.concatenate([points, [[30.0, 30.0, 0.0]]]), GROUND)
     assert boxes.shape == (3, 7) and boxes.dtype == np.float32
     assert points_in_boxes(points, boxes, margin_m=1e-3).sum(axis=1).tolist() == [1] * 600
     assert np.allclose(boxes[:, 2] - boxes[:, 5] / 2, GROUND.heights(boxes[:, :2].astype(float)), atol=1e-5)
-
-
-def test_a_long_cluster_is_cut_and_a_short_one_beside_it_is_not() -> None:
     hedge = np.column_stack([np.arange(1, 31, 0.1), np.full(300, 4.0), np.full(300, -0.5)])
     car = np.column_stack([np.arange(3, 7, 0.1), np.full(40, -2.0), np.full(40, -0.5)])
     boxes = cluster_boxes(np.concatenate([hedge, car]), GROUND)
     lengths = np.sort(boxes[:, 3:5].max(axis=1))
     assert np.allclose(lengths, [0.9, 3.9, 3.9, *[4.9] * 5], atol=1e-3)
-
-
-def test_nothing_stands() -> None:
     for points in (np.zeros((0, 3)), np.array([[10.0, 0, 0], [20, 0, 0]])):
         assert cluster_boxes(points, GROUND).shape == (0, 7)

@@ -100,13 +100,6 @@ def test_other_axes_or_another_pose_make_another(tmp_path: Path) -> None:
     assert np.array_equal(boxes(""), straight) and len(list((tmp_path / "prepared").rglob("*.json"))) == 4
 
 
-def test_a_scan_that_is_not_there_is_named(split: KittiSplit, tmp_path: Path) -> None:
-    prepare(split, tmp_path / "prepared")
-    split.scan_path("000001").unlink()
-    with pytest.raises(AscaError, match=r"000001\.bin"):
-        prepare(split, tmp_path / "prepared")
-
-
 def test_any_number_of_processes_writes_the_same_everywhere(
     split: KittiSplit, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -143,12 +136,16 @@ def test_builders_at_the_same_time_do_not_meet(split: KittiSplit, tmp_path: Path
     assert not list(tmp_path.rglob(".*"))
 
 
-def test_what_goes_to_a_worker_is_the_path(split: KittiSplit, tmp_path: Path) -> None:
+def test_what_goes_to_a_worker_is_the_path_of_what_must_be_there(split: KittiSplit, tmp_path: Path) -> None:
     database = prepare(split, tmp_path / "prepared")
     box = database[3].box
     assert len(pickle.dumps(database)) < 1000
     rebuild, arguments = database.__reduce__()  # what the other process does with it
     assert np.array_equal(rebuild(*arguments)[3].box, box)
+    prepare(split, tmp_path / "prepared")
+    split.scan_path("000001").unlink()
+    with pytest.raises(AscaError, match=r"000001\.bin"):
+        prepare(split, tmp_path / "prepared")
 
 
 def test_a_folder_that_cannot_be_written_is_named_before_the_work(

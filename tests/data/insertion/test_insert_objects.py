@@ -3,13 +3,11 @@
 import dataclasses
 import itertools
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from torch.utils.data import DataLoader
 
 from asca_pillars.base.errors import ConfigError, DatasetError
 from asca_pillars.cli.prepare import prepare
@@ -20,23 +18,16 @@ from asca_pillars.data.boxes.box_split import BoxSplit
 from asca_pillars.data.frames import LabeledFrame, read_frame, within_ranges
 from asca_pillars.data.insertion.gt_database import prepare_database
 from asca_pillars.data.insertion.insert_objects import Inserter, insert_objects, insertion_shares
-from asca_pillars.data.kitti import (
-    KittiSplit,
-    boxes_from_objects,
-    objects_3d,
-    read_labels,
-    write_image_set,
-    write_labels,
-)
+from asca_pillars.data.kitti import KittiSplit, objects_3d, read_labels, write_image_set, write_labels
 from asca_pillars.geometry.boxes import points_in_boxes
 from asca_pillars.scans.scan_reader import write_scan
-from asca_pillars.training.dataset import Collate, open_dataset
-from asca_pillars.training.shared_batches import loader_context
+from asca_pillars.training.dataset import open_dataset
 from tests.data.insertion.inserters import METHODS, config, open_inserter
 from tests.data.insertion.simple_streets import TYPES, polygons, write_streets
 from tests.helpers.scenes import SPEC
+from tests.helpers.sent import sent
 
-FRAMES = 6
+FRAMES = 4
 
 
 @pytest.fixture(scope="module")
@@ -65,7 +56,7 @@ def assert_same(one: LabeledFrame, other: LabeledFrame) -> None:
     assert np.array_equal(one.points, other.points) and np.array_equal(one.boxes, other.boxes)
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=60)
 @given(
     st.lists(st.tuples(st.floats(0, 20), st.one_of(st.just(0.0), st.floats(0.05, 3))), min_size=1, max_size=5).filter(
         lambda pairs: any(wanted for _, wanted in pairs)
@@ -83,25 +74,11 @@ def test_shares_fill_the_classes_up_to_one_level(pairs: list[tuple[float, float]
     assert (after[~filled] >= after[filled].min() - 1e-6 * after.max()).all()
 
 
-@pytest.mark.parametrize(
-    ("wanted", "added"),
-    [
-        # 4 + 1 + 0 objects and 6 more make 11; the car's 4 exceed a third: the others share 7, 3.5 each.
-        ([1, 1, 1], [0, 2.5, 3.5]),
-        # Twice as many pedestrians as of the others: 11 = 2.75 + 5.5 + 2.75, but there are 4 cars; 7 = 4.67 + 2.33.
-        ([1, 2, 1], [0, 11 / 3, 7 / 3]),
-    ],
-)
-def test_shares_by_hand(wanted: list[float], added: list[float]) -> None:
-    shares = insertion_shares(np.array([4.0, 1.0, 0.0]), np.array(wanted, float), 6)
-    assert shares * 6 == pytest.approx(added)
-
-
 @pytest.mark.parametrize("method", METHODS)
 def test_what_is_inserted_touches_nothing(root: Path, method: str) -> None:
     inserter = inserter_of(root, method, objects=8)
     inserted = 0
-    for number, seed in itertools.product(range(FRAMES), range(5)):
+    for number, seed in itertools.product(range(FRAMES), range(2)):
         before, after = augmented(inserter, root, number, seed)
         new, others = polygons(after.boxes[len(before.boxes) :]), polygons(before.boxes)
         if method == "rs_aug":
@@ -109,7 +86,7 @@ def test_what_is_inserted_touches_nothing(root: Path, method: str) -> None:
         assert not any(one.intersection(other).area > 1e-6 for one in new for other in others)
         assert not any(a.intersection(b).area > 1e-6 for a, b in itertools.combinations(new, 2))
         inserted += len(new)
-    assert inserted > 2 * FRAMES * 5
+    assert inserted > 2 * FRAMES * 2
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -124,20 +101,22 @@ def test_the_rest_of_the_frame_stays(root: Path, method: str) -> None:
     assert after.frame_id == before.frame_id and len(after.boxes) == len(after.labels)
     kept = {tuple(row) for row in before.points.tolist()}
     new = np.array([tuple(row) not in kept for row in after.points.tolist()])
-    within, deep_within = (
-        np.any(points_in_boxes(after.points, after.boxes[count:], margin_m=margin_m), axis=1)
-        for margin_m in (1e-3, -1e-3)
-    )
-    assert new.any() and within[new].all()
-    assert not deep_within[~new].any()  # of the frame, nothing is left in the new boxes
+    held = [points_in_boxes(after.points, after.boxes[count:], margin_m) for margin_m in (1e-3, -1e-3)]
+    within, deep = (np.any(inside, axis=1) for inside in held)
+    assert new.any() and within[new].all() and not deep[~new].any(), "of the frame, nothing is left in the new boxes"
 
 
-def test_objects_of_gt_aug_stand_where_they_stood(root: Path) -> None:
+def test_gt_aug_leaves_objects_in_place_and_another_process_gives_the_same(root: Path) -> None:
     inserter = inserter_of(root, "gt_aug")
     stored = {tuple(box) for box in inserter.database.boxes.tolist()}
     before, after = augmented(inserter, root, 1)
     new = after.boxes[len(before.boxes) :]
     assert len(new) and all(tuple(box) in stored for box in new.tolist())
+    # The loader sends its workers what it has pickled.
+    frames = open_dataset(root, config("rs_aug"), training=True)
+    there = sent(frames)
+    for index in ((0, 1), (1, 0)):
+        assert_same(there.sample(*index).frame, frames.sample(*index).frame)
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -149,7 +128,7 @@ def test_other_types_are_in_the_way_too(tmp_path: Path, method: str) -> None:
     lorry = dataclasses.replace(car, type="Truck", length_m=100.0, width_m=100.0)
     write_labels(split.label_path("000000"), [lorry])
     before, after = augmented(inserter, tmp_path, 0)
-    assert len(boxes_from_objects([lorry], split.calibration("000000"))) == 1 and len(before.boxes) == 0
+    assert len(before.boxes) == 0
     assert_same(before, after)
 
 
@@ -162,7 +141,7 @@ def test_counts_approach_the_proportions(
 ) -> None:
     inserter = inserter_of(root, "rs_aug", objects=4, proportions=proportions)
     before, after = np.zeros(3), np.zeros(3)
-    for number, seed in itertools.product(range(FRAMES), range(8)):
+    for number, seed in itertools.product(range(FRAMES), range(6)):
         for counts, frame in zip((before, after), augmented(inserter, root, number, seed), strict=True):
             counts += np.bincount(frame.labels[frame.labels >= 0], minlength=3)
     if expected is None:  # the class that was not asked for stays as it is
@@ -191,34 +170,17 @@ def test_samples_depend_on_seed_epoch_and_frame_alone(root: Path, method: str) -
     assert len(early.sample(1, 3).frame.boxes) > len(early.sample(2, 3).frame.boxes)
 
 
-def test_any_number_of_workers_gives_the_same(root: Path) -> None:
-    frames = open_dataset(root, config("rs_aug"), training=True)
-    batches = [[(0, number), (1, number)] for number in range(FRAMES)]
-    options: dict[str, Any] = {"collate_fn": Collate(frames.preparation), "multiprocessing_context": loader_context()}
-    loader = DataLoader(frames, batch_sampler=batches, num_workers=2, **options)
-    for batch, indices in zip(loader, batches, strict=True):
-        for boxes, labels, index in zip(batch.boxes, batch.labels, indices, strict=True):
-            expected = frames.sample(*index).frame
-            assert np.array_equal(boxes, expected.boxes) and np.array_equal(labels, expected.labels)
-
-
 def test_without_insertion_everything_is_as_before(root: Path, tmp_path: Path) -> None:
     """Neither method `none` nor 0 objects changes what else is drawn, and no folder is made for `none`."""
     plain = prepared_in(tmp_path / "prepared", config("none"))
-    rng = np.random.default_rng((plain.train.seed, 2, 4))
-    frame = within_ranges(augment(frame_of(root, 4), plain.augment, rng), SPEC.grid.ranges)
+    rng = np.random.default_rng((plain.train.seed, 2, 3))
+    frame = within_ranges(augment(frame_of(root, 3), plain.augment, rng), SPEC.grid.ranges)
     pillars = SPEC.pillarize(frame.points)
     for settings_ in (plain, config("rs_aug", objects=0), config("gt_aug", objects=0)):
-        sample = open_dataset(root, settings_, training=True).sample(2, 4)
+        sample = open_dataset(root, settings_, training=True).sample(2, 3)
         assert_same(sample.frame, frame)
         assert np.array_equal(sample.prepared.pillars.features, pillars.features)
     assert not (tmp_path / "prepared").exists()
-
-
-def test_validation_frames_get_nothing(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("asca_pillars.data.training_frames.prepare_inserter", lambda *_: pytest.fail("built"))
-    sample = open_dataset(root, config("rs_aug"), training=False).sample(0, 0)
-    assert np.array_equal(sample.frame.points, frame_of(root, 0).points)
 
 
 def test_a_frame_without_ground_or_points_stays_as_it_is(tmp_path: Path) -> None:
@@ -251,7 +213,7 @@ def test_impossible_proportions_are_refused(proportions: dict[str, float], messa
         config("rs_aug", proportions=proportions)
 
 
-def test_the_database_is_built_by_as_many_processes_as_load(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_processes_of_the_database_and_plain_validation(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[int] = []
     monkeypatch.setattr(
         "asca_pillars.data.insertion.insert_objects.prepare_database",
@@ -259,6 +221,9 @@ def test_the_database_is_built_by_as_many_processes_as_load(root: Path, monkeypa
     )
     open_inserter(KittiSplit(root, "train"), dataclasses.replace(config("gt_aug"), data=DataConfig(workers=3)))
     assert asked == [3]
+    monkeypatch.setattr("asca_pillars.data.training_frames.prepare_inserter", lambda *_: pytest.fail("built"))
+    sample = open_dataset(root, config("rs_aug"), training=False).sample(0, 0)
+    assert np.array_equal(sample.frame.points, frame_of(root, 0).points)
 
 
 def test_prepare_leaves_nothing_for_training_to_compute(

@@ -9,12 +9,7 @@ import pytest
 
 from asca_pillars.config.tree import DataConfig
 from asca_pillars.data.boxes.box_records import json_line, read_frames, records_from
-from asca_pillars.data.inspection.box_conventions import (
-    CONVENTIONS,
-    better_convention,
-    convention_fits,
-    count_points,
-)
+from asca_pillars.data.inspection.box_conventions import CONVENTIONS, better_convention, convention_fits, count_points
 from asca_pillars.data.inspection.findings import findings
 from asca_pillars.data.inspection.inspect_dataset import inspect_dataset
 from asca_pillars.data.kitti import KittiSplit
@@ -67,7 +62,7 @@ def test_right_labels_pass_and_wrong_ones_are_told(frames: str, request: pytest.
     assert name_of(given, swapped) == "turned by 90 degrees"
 
 
-def test_the_counts_are_those_of_the_changed_boxes(scenes: list[tuple[np.ndarray, np.ndarray]]) -> None:
+def test_counts_are_those_of_changed_boxes_and_some_say_nothing(scenes: list[tuple[np.ndarray, np.ndarray]]) -> None:
     points, boxes = scenes[0]
     counts = count_points(points, boxes)
     changes = {"as labelled": boxes} | {name: wrong(boxes.astype(np.float64)) for name, wrong in WRONG.items()}
@@ -78,10 +73,7 @@ def test_the_counts_are_those_of_the_changed_boxes(scenes: list[tuple[np.ndarray
         np.testing.assert_array_equal(row, points_in_boxes(points, changed).sum(axis=0), err_msg=convention.name)
     assert count_points(points, boxes[:0]).shape == (6, 0)
     assert better_convention(convention_fits(np.zeros((6, 0), np.int64))) is None
-
-
-def test_boxes_that_say_nothing_are_not_doubted() -> None:
-    """Square boxes and objects without points fit every yaw alike."""
+    # Square boxes and objects without points fit every yaw alike.
     rng = np.random.default_rng(0)
     boxes = np.zeros((20, 8, 7), np.float32)
     boxes[..., :2], boxes[..., 3:6] = rng.uniform(5, 40, (20, 8, 2)), (0.7, 0.7, 1.8)
@@ -94,10 +86,8 @@ def test_boxes_that_say_nothing_are_not_doubted() -> None:
 
 def rewritten(root: Path, change: Callable[[np.ndarray], np.ndarray]) -> Path:
     write_box_dataset(root, 12, names=("Car", "Car", "Pedestrian", "Cyclist"))
-    lines = [
-        json_line(frame.scan, records_from(change(frame.records.boxes), frame.records.types))
-        for frame in read_frames(root / "labels.jsonl")
-    ]
+    frames = [(scan, records) for scan, records, *_ in read_frames(root / "labels.jsonl")]
+    lines = [json_line(scan, records_from(change(records.boxes), records.types)) for scan, records in frames]
     (root / "labels.jsonl").write_text("".join(lines))
     return root
 

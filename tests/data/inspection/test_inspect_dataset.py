@@ -42,11 +42,8 @@ from tests.helpers.scenes import GRID, SIZES, SPEC, make_scene
 from tests.models.pv_rcnn import tiny_pv_rcnn
 
 
-def test_clean_data_gives_nothing_to_warn_of(clean: Path) -> None:
+def test_clean_data_gives_nothing_to_warn_of_and_numbers_by_plain_loops(clean: Path) -> None:
     assert found(clean) == []
-
-
-def test_counts_sizes_and_points_of_a_class_by_plain_loops(clean: Path) -> None:
     inspection = inspected(clean, CONFIG)
     assert inspection.types == {"Car": 2 * FRAMES, "Pedestrian": FRAMES, "Cyclist": FRAMES}
     cars = [box for seed in range(FRAMES) for box, name in zip(*make_scene(seed)[1:], strict=True) if name == "Car"]
@@ -61,13 +58,21 @@ def test_counts_sizes_and_points_of_a_class_by_plain_loops(clean: Path) -> None:
     assert inspection.frames_without_objects == 0 and not inspection.sampled
 
 
-def test_points_of_a_box_are_those_in_it(clean: Path) -> None:
+def test_points_sizes_and_pillars_are_those_of_plain_loops(clean: Path) -> None:
     split = KittiSplit(clean)
     measure = measure_frame(split, "000000", pillar_spec(CONFIG), CONFIG.data)
     points = read_scan(split.scan_path("000000")).points  # the camera sees all of the boxes
     counts = points_in_boxes(points, measure.boxes).sum(axis=0).tolist()
     assert measure.points.tolist() == counts and min(counts) > 20
     assert measure.labels.tolist() == [0, 0, 1, 2]
+    spec = dataclasses.replace(SPEC, limits=PillarLimits(max_pillars=5000, max_points=3))
+    scan, stats = measure_scan(points, points, spec), spec.pillarize(points).stats
+    assert (scan.points, scan.inside) == (stats.points, stats.points - stats.points_outside)
+    assert scan.cells == stats.pillars and scan.cut == stats.points_over_limit > 0
+    per_pillar = dataclasses.replace(spec, limits=PillarLimits(5000, 5000)).pillarize(points).point_counts
+    assert (scan.fullest, scan.crowded) == (per_pillar.max(), (per_pillar > 3).sum())
+    few = dataclasses.replace(spec, limits=PillarLimits(max_pillars=100, max_points=3)).pillarize(points).stats
+    assert scan.cells == few.pillars + few.pillars_over_limit
 
 
 ONE_ZONE = PillarModel(spec=dataclasses.replace(SPEC, grid=dataclasses.replace(GRID, zones=1)))
@@ -109,7 +114,7 @@ def outcomes_of(
     return outcomes.tolist(), positives
 
 
-@settings(max_examples=30)
+@settings(max_examples=15)
 @given(st.integers(0, 2), st.floats(6.5, 23), st.floats(-4.5, 5.5), st.floats(0.5, 1.8), st.floats(-3.1, 3.1))
 def test_an_objects_outcome_by_its_overlap_with_every_anchor(
     label: int, x: float, y: float, stretch: float, yaw: float
@@ -137,21 +142,16 @@ def test_outcomes_by_hand() -> None:
     assert outcomes[4:] == [MatchOutcome.LEFT_OUT] * 2 and positives[2] == 0
     tiny = [[x, y, -0.6, 0.3, 0.3, 1.7, 0.0]] * 2
     assert outcomes_of(tiny, [1, 1])[0] == [MatchOutcome.MISSED, MatchOutcome.FORCED]
+    # A short car, which no anchor overlaps by positive_iou, and tiny boxes that have the same best anchors.
+    x, y = SPEC.anchors[20, 15, 0, :2]
+    boxes, labels = [[x, y, -1.0, 2.0, 1.6, 1.56, 0.0]] + [[x, y + 5, -0.6, 0.3, 0.3, 1.7, 0.0]] * 2, [0, 1, 1]
+    outcomes, positives = outcomes_of(boxes, labels, "atss")
+    assert outcomes == [MatchOutcome.OVERLAPPED, MatchOutcome.MISSED, MatchOutcome.OVERLAPPED]
+    targets = assign_targets(SPEC.anchors, SPEC.classes, np.array(boxes, np.float32), np.array(labels), "atss")
+    assert positives.tolist() == np.bincount(np.array(labels)[targets.matched], minlength=3).tolist()
 
 
-def test_pillars_before_the_limits_agree_with_what_pillarize_drops(clean: Path) -> None:
-    spec = dataclasses.replace(SPEC, limits=PillarLimits(max_pillars=5000, max_points=3))
-    points = read_scan(KittiSplit(clean).scan_path("000000")).points
-    measure, stats = measure_scan(points, points, spec), spec.pillarize(points).stats
-    assert (measure.points, measure.inside) == (stats.points, stats.points - stats.points_outside)
-    assert measure.cells == stats.pillars and measure.cut == stats.points_over_limit > 0
-    per_pillar = dataclasses.replace(spec, limits=PillarLimits(5000, 5000)).pillarize(points).point_counts
-    assert (measure.fullest, measure.crowded) == (per_pillar.max(), (per_pillar > 3).sum())
-    few = dataclasses.replace(spec, limits=PillarLimits(max_pillars=100, max_points=3)).pillarize(points).stats
-    assert measure.cells == few.pillars + few.pillars_over_limit
-
-
-def test_evenly_spaced_frames(clean: Path) -> None:
+def test_frames_are_evenly_spaced_and_anchors_of_another_size_are_noticed(clean: Path) -> None:
     inspection = inspected(clean, CONFIG, frames=4)
     assert (inspection.frames, inspection.frames_in_split, inspection.sampled) == (4, FRAMES, True)
     chosen = [
@@ -161,6 +161,13 @@ def test_evenly_spaced_frames(clean: Path) -> None:
     assert inspection.scans.points.largest == max(frame.scan.points for frame in chosen)
     assert inspection.classes[1].positives == sum(frame.positives[1] for frame in chosen)
     assert inspected(clean, CONFIG, frames=99, split="val").frames == 1
+    (car, *others) = SPEC.classes
+    config = with_detector(classes=(dataclasses.replace(car, length_m=8.0), *others))
+    (warning,) = found(clean, config)
+    assert warning.text.startswith("Car: 100 % of the boxes differ too much in size from the anchor for positive_iou")
+    advised = float(warning.text.split("length_m ")[1].split(",")[0])
+    assert advised == pytest.approx(3.9, abs=0.2)
+    assert inspected(clean, config).classes[0].misfits == 2 * FRAMES
 
 
 @pytest.mark.parametrize("height_m", [-1.73, 1.0])
@@ -204,16 +211,6 @@ def test_scans_that_were_raised_without_their_labels(data: Path) -> None:
 def test_settings_that_do_not_fit_the_data(clean: Path, config: Config, about: str, message: str) -> None:
     texts = [item.text for item in found(clean, config) if item.about == about]
     assert any(re.search(message, text) for text in texts), texts
-
-
-def test_anchors_of_another_size(clean: Path) -> None:
-    (car, *others) = SPEC.classes
-    config = with_detector(classes=(dataclasses.replace(car, length_m=8.0), *others))
-    (warning,) = found(clean, config)
-    assert warning.text.startswith("Car: 100 % of the boxes differ too much in size from the anchor for positive_iou")
-    advised = float(warning.text.split("length_m ")[1].split(",")[0])
-    assert advised == pytest.approx(3.9, abs=0.2)
-    assert inspected(clean, config).classes[0].misfits == 2 * FRAMES
 
 
 def test_points_that_are_not_numbers_and_scans_that_see_nothing(data: Path) -> None:
@@ -279,13 +276,3 @@ def test_reflectance_on_another_scale(data: Path, scale: float, every: int, mess
 def test_a_speck_of_reflectance_is_none_that_reading_minds(data: Path, speck: float) -> None:
     change_scans(data, lambda points: points.__setitem__((0, 3), speck), every=4)
     assert found(data) == []
-
-
-def test_outcomes_by_hand_without_thresholds() -> None:
-    """A short car, which no anchor overlaps by positive_iou, and tiny boxes that have the same best anchors."""
-    x, y = SPEC.anchors[20, 15, 0, :2]
-    boxes, labels = [[x, y, -1.0, 2.0, 1.6, 1.56, 0.0]] + [[x, y + 5, -0.6, 0.3, 0.3, 1.7, 0.0]] * 2, [0, 1, 1]
-    outcomes, positives = outcomes_of(boxes, labels, "atss")
-    assert outcomes == [MatchOutcome.OVERLAPPED, MatchOutcome.MISSED, MatchOutcome.OVERLAPPED]
-    targets = assign_targets(SPEC.anchors, SPEC.classes, np.array(boxes, np.float32), np.array(labels), "atss")
-    assert positives.tolist() == np.bincount(np.array(labels)[targets.matched], minlength=3).tolist()

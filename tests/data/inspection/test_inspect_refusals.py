@@ -72,15 +72,12 @@ def test_the_tables_come_before_the_refusal(data: Path, tmp_path: Path, capsys: 
     assert [item["boxes"] for item in report["classes"]] == [2 * FRAMES, FRAMES, 0]
 
 
-def test_a_class_missing_in_a_sample_may_be_in_the_rest(data: Path) -> None:
+def test_what_is_missing_in_a_sample_or_beside_it_is_named(data: Path) -> None:
     for frame_id in ("000000", "000006"):
         path = KittiSplit(data).label_path(frame_id)
         path.write_text(re.sub("Cyclist.*\n", "", path.read_text()))
     (first, *_) = findings(inspected(data, CONFIG, frames=2), pillar_spec(CONFIG), CONFIG.data.min_points)
     assert "look at all frames with --frames 12" in first.text
-
-
-def test_missing_files_are_named_though_their_frames_were_not_chosen(data: Path) -> None:
     split = KittiSplit(data)
     split.calib_path("000001").unlink()
     split.label_path("000002").unlink()

@@ -75,10 +75,7 @@ def test_anchors_stand_where_the_detector_has_them(clean: Path, last_stride: int
             with_spec(last_stride=2, grid=dataclasses.replace(SPEC.grid, **EVEN)),
             r"Pedestrian: .* set model.spec.last_stride=1, or make model.spec.grid.size_m",
         ),
-        (
-            with_grid(size_m=(0.4, 0.4, 0.1), **EVEN),
-            "Pedestrian: .* make model.spec.grid.size_m smaller along x",
-        ),
+        (with_grid(size_m=(0.4, 0.4, 0.1), **EVEN), "Pedestrian: .* make model.spec.grid.size_m smaller along x"),
         (
             with_grid(max_points=1, size_m=(0.4, 0.4, 0.2), z_range_m=(-4.0, 2.0), **EVEN),
             r"model.spec.grid.max_points = 1 takes away \d+ % of the points; raise it, or make the voxels smaller",

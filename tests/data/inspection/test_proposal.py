@@ -76,16 +76,13 @@ def test_a_range_to_the_sides_that_holds_the_boxes_stays_where_boxes_stand_behin
     assert grid.y_range_m == wide.y_range_m
 
 
-def test_a_range_ahead_is_widened_to_legal_ones_and_stays_where_it_holds_the_boxes(tmp_path: Path) -> None:
+def test_legal_ranges_classes_with_enough_boxes_and_room_for_pillars(tmp_path: Path) -> None:
     narrow = PillarGrid(x_range_m=(4.8, 15.04), y_range_m=(-2.56, 2.56), v_max_m=0.32, zones=2)
     split = BoxSplit(write_box_dataset(tmp_path, 12))
     grid = pillar_spec(propose(split, with_grid(narrow)).config).grid
     assert grid.zones == 2 and grid.x_range_m[1] > 20 and grid.y_range_m == (-grid.y_range_m[1], grid.y_range_m[1])
     spec = propose(split, CONFIG).config.model.spec
     assert spec.grid == SPEC.grid and spec.class_names == ("Car", "Forklift")
-
-
-def test_pillars_get_room(tmp_path: Path) -> None:
     split = BoxSplit(write_box_dataset(tmp_path, 12))
     grass = np.random.default_rng(0).uniform([5, -6, -1.7, 0], [25, 7, -1.6, 1], (3300, 4))
     write_scan(split.scan_path("000003"), np.concatenate([split.points("000003"), grass]))  # the fullest by far

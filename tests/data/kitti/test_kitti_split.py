@@ -70,7 +70,7 @@ def test_missing_parts_of_a_dataset_are_named(root):
         assert_one_line(place, words, action)
 
 
-def test_scans_of_five_columns_are_stored_as_they_are_read(root):
+def test_scans_of_five_columns_and_labels_that_stand_all_around(root) -> None:
     """With the number of the beam after the reflectance; 5 points are no whole number of points of four columns."""
     rng = np.random.default_rng(0)
     points = np.column_stack([rng.uniform(-20, 20, (5, 3)), rng.random(5)]).astype("<f4")
@@ -78,6 +78,13 @@ def test_scans_of_five_columns_are_stored_as_they_are_read(root):
     np.column_stack([points, np.arange(5)]).astype("<f4").tofile(split.scan_path("000001"))
     np.testing.assert_array_equal(split.stored_points("000001"), points)
     np.testing.assert_array_equal(split.points("000001", camera_view=False), points)
+    assert KittiSplit(root).has_camera
+    for view, camera in (("around", False), ("full", True), ("camera", True)):
+        (root / "simulation.json").write_text(json.dumps({"seed": 1, "field_of_view": view}))
+        assert KittiSplit(root).has_camera is camera
+    (root / "simulation.json").write_text("{")
+    with pytest.raises(DatasetError, match=r"simulation\.json"):
+        _ = KittiSplit(root).has_camera
 
 
 def test_image_size_is_read_from_the_png_or_assumed(root):
@@ -92,16 +99,6 @@ def test_image_size_is_read_from_the_png_or_assumed(root):
         assert_one_line(split.image_path("000001"), ["no PNG"], lambda: split.image_size_wh("000001"))
 
 
-def test_labels_stand_all_around_where_the_simulator_says_so(root):
-    assert KittiSplit(root).has_camera
-    for view, camera in (("around", False), ("full", True), ("camera", True)):
-        (root / "simulation.json").write_text(json.dumps({"seed": 1, "field_of_view": view}))
-        assert KittiSplit(root).has_camera is camera
-    (root / "simulation.json").write_text("{")
-    with pytest.raises(DatasetError, match=r"simulation\.json"):
-        _ = KittiSplit(root).has_camera
-
-
 # --- real frames, where there are some
 
 
@@ -113,7 +110,7 @@ def kitti_mini():
     return KittiSplit(folder)
 
 
-def test_every_real_label_survives_the_round_trip(kitti_mini, tmp_path):
+def test_real_labels_survive_the_round_trip_and_scans_are_read_whole(kitti_mini, tmp_path) -> None:
     for frame_id in kitti_mini.frame_ids:
         calib, labels = kitti_mini.calibration(frame_id), kitti_mini.objects(frame_id)
         write_labels(tmp_path / "again.txt", labels)
@@ -127,9 +124,6 @@ def test_every_real_label_survives_the_round_trip(kitti_mini, tmp_path):
             if before.type != "Pedestrian":  # their arms and legs leave the box
                 np.testing.assert_allclose(after.bbox, before.bbox, atol=2.0)
                 assert abs(math.remainder(after.alpha - before.alpha, 2 * math.pi)) < 0.05
-
-
-def test_real_scans_are_read_whole(kitti_mini):
     frame_id = kitti_mini.frame_ids[0]
     scan = read_scan(kitti_mini.scan_path(frame_id))
     assert len(scan.points) > 100_000
@@ -174,15 +168,7 @@ def test_the_lists_are_the_published_ones(kitti: Path) -> None:
     assert write_train_val_lists(kitti) == [], "they are there"
 
 
-def test_lists_of_ones_own_stay(kitti: Path) -> None:
-    write_image_set(kitti, "val", ["000001"])
-    with pytest.raises(OutputError, match=r"val\.txt: lists other frames"):
-        write_train_val_lists(kitti)
-    assert [path.name for path in (kitti / "ImageSets").iterdir()] == ["val.txt"]
-    assert KittiSplit(kitti, "val").frame_ids == ("000001",)
-
-
-def test_other_frames_than_kittis_are_refused(kitti: Path) -> None:
+def test_lists_of_ones_own_stay_and_other_frames_are_refused(kitti: Path) -> None:
     folder = kitti / "training" / "velodyne"
     for old, new, message in (("000007", ".000007", "7480 of KITTI's 7481"), ("000007", "007481", "and 1 others")):
         (folder / f"{old}.bin").rename(folder / f"{new}.bin")
@@ -190,6 +176,11 @@ def test_other_frames_than_kittis_are_refused(kitti: Path) -> None:
             write_train_val_lists(kitti)
         (folder / f"{new}.bin").rename(folder / f"{old}.bin")
     assert not (kitti / "ImageSets").exists()
+    write_image_set(kitti, "val", ["000001"])
+    with pytest.raises(OutputError, match=r"val\.txt: lists other frames"):
+        write_train_val_lists(kitti)
+    assert [path.name for path in (kitti / "ImageSets").iterdir()] == ["val.txt"]
+    assert KittiSplit(kitti, "val").frame_ids == ("000001",)
 
 
 def test_asca_prepare_writes_them_first(kitti: Path) -> None:

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from functools import cache
 
 import numpy as np
 from shapely.affinity import rotate, translate
@@ -28,31 +29,25 @@ def random_frames(seed: int, frames: int = 6, classes: tuple[str, ...] = ("Car",
         near[:, 6] += rng.normal(0, 0.3, len(near))
         wild = np.column_stack([rng.uniform(-60, 60, (3, 3)), rng.uniform(1, 5, (3, 3)), rng.uniform(-3, 3, 3)])
         found = np.concatenate([near, wild])
-        result.append(
-            EvaluatedFrame(
-                str(number),
-                objects,
-                rng.choice(classes, count).tolist(),
-                rng.random(count) < 0.9,
-                found,
-                rng.choice(classes, len(found)).tolist(),
-                scores[40 * number : 40 * number + len(found)],
-            )
-        )
+        types, seen = rng.choice(classes, count).tolist(), rng.random(count) < 0.9
+        kinds, own = rng.choice(classes, len(found)).tolist(), scores[40 * number : 40 * number + len(found)]
+        result.append(EvaluatedFrame(str(number), objects, types, seen, found, kinds, own))
     return result
 
 
-def iou(a: Box, b: Box, *, flat: bool) -> float:
-    shapes = [
-        translate(rotate(rectangle(-o[3] / 2, -o[4] / 2, o[3] / 2, o[4] / 2), o[6], use_radians=True), o[0], o[1])
-        for o in (a, b)
-    ]
-    shared = shapes[0].intersection(shapes[1]).area
-    if flat:
-        return shared / (a[3] * a[4] + b[3] * b[4] - shared)
+@cache
+def overlaps(a: tuple[float, ...], b: tuple[float, ...]) -> tuple[float, float]:
+    """IoU from above, and of the volumes."""
+    flat = [rectangle(-o[3] / 2, -o[4] / 2, o[3] / 2, o[4] / 2) for o in (a, b)]
+    turned = [translate(rotate(one, o[6], use_radians=True), o[0], o[1]) for one, o in zip(flat, (a, b), strict=True)]
+    shared = turned[0].intersection(turned[1]).area
     tall = min(a[2] + a[5] / 2, b[2] + b[5] / 2) - max(a[2] - a[5] / 2, b[2] - b[5] / 2)
     volume = shared * max(tall, 0)
-    return volume / (a[3] * a[4] * a[5] + b[3] * b[4] * b[5] - volume)
+    return shared / (a[3] * a[4] + b[3] * b[4] - shared), volume / (math.prod(a[3:6]) + math.prod(b[3:6]) - volume)
+
+
+def iou(a: Box, b: Box, *, flat: bool) -> float:
+    return overlaps(tuple(a), tuple(b))[not flat]
 
 
 def ranked(frames: list[EvaluatedFrame], name: str) -> list[tuple[float, int, Box]]:
@@ -94,14 +89,11 @@ def iou_ap(frames: list[EvaluatedFrame], name: str, least: float, keep: Callable
     hidden = objects_of(frames, name, visible=False)
     curve, true, false = [], 0, 0
     for _, number, box, owner in taken:
-        if owner is not None:
-            if not keep(owner):
-                continue
-            true += 1
-        else:
-            if not keep(box) or any(own == number and iou(box, other, flat=flat) >= least for own, other in hidden):
-                continue
-            false += 1
+        if owner is None and any(own == number and iou(box, other, flat=flat) >= least for own, other in hidden):
+            continue
+        if not keep(owner or box):
+            continue
+        true, false = true + (owner is not None), false + (owner is None)
         curve.append((true / total if total else 0, true / (true + false)))
     if not total:
         return None
@@ -115,14 +107,10 @@ def iou_ap(frames: list[EvaluatedFrame], name: str, least: float, keep: Callable
 
 def interpolate(at: float, xs: list[float], ys: list[float]) -> float:
     """A line through the points; level before the first. Of points with one x the last counts, as in NumPy."""
-    if at < xs[0]:
-        return ys[0]
-    for i in range(len(xs) - 1, -1, -1):
-        if xs[i] <= at:
-            if i == len(xs) - 1 or xs[i] == at:
-                return ys[i]
-            return ys[i] + (ys[i + 1] - ys[i]) * (at - xs[i]) / (xs[i + 1] - xs[i])
-    raise AssertionError
+    last = max((i for i, x in enumerate(xs) if x <= at), default=-1)
+    if last in (-1, len(xs) - 1) or xs[last] == at:
+        return ys[max(last, 0)]
+    return ys[last] + (ys[last + 1] - ys[last]) * (at - xs[last]) / (xs[last + 1] - xs[last])
 
 
 def nuscenes_errors(box: Box, other: Box) -> list[float]:
@@ -132,9 +120,8 @@ def nuscenes_errors(box: Box, other: Box) -> list[float]:
 
 
 def argoverse_errors(box: Box, other: Box) -> list[float]:
-    kept = 1.0  # of each extent the smaller one over the larger one
-    for a, b in zip(box[3:6], other[3:6], strict=True):
-        kept *= min(a, b) / max(a, b)
+    # Of each extent the smaller one over the larger one.
+    kept = math.prod(min(a, b) / max(a, b) for a, b in zip(box[3:6], other[3:6], strict=True))
     return [math.dist(box[:3], other[:3]), 1 - kept, turned(box, other)]
 
 

@@ -8,16 +8,13 @@ from asca_pillars.evaluation.errors.error_summary import BLOCK_FRAMES, DRAWS, MI
 FRAMES = 60
 
 
-def test_blocks_are_drawn_whole() -> None:
+def test_blocks_are_drawn_whole_and_parts_before_them() -> None:
     drawn = bootstrap_samples([np.arange(FRAMES)], FRAMES)
     assert drawn.weights.shape == (DRAWS, FRAMES)
     blocks = drawn.weights.reshape(DRAWS, FRAMES // BLOCK_FRAMES, BLOCK_FRAMES)
     assert (blocks == blocks[..., :1]).all()
     assert (blocks[..., 0].sum(axis=1) == FRAMES // BLOCK_FRAMES).all()
     np.testing.assert_allclose(drawn.weights.mean(axis=0), 1, atol=0.25)
-
-
-def test_parts_are_drawn_before_blocks() -> None:
     parts = [np.arange(0, 30), np.arange(30, 50)]
     drawn = bootstrap_samples(parts, FRAMES)
     assert not drawn.weights[:, 50:].any(), "frames of no part"
@@ -37,15 +34,12 @@ def test_median_and_ratio_are_those_of_the_resamples() -> None:
     assert drawn.ratio_interval(parts, wholes) == pytest.approx(np.quantile(ratios, [0.025, 0.975]))
 
 
-def test_frames_that_are_alike_make_wider_intervals() -> None:
+def test_like_frames_make_wide_intervals_and_few_blocks_none() -> None:
     rng = np.random.default_rng(2)
     drawn, frames = bootstrap_samples([np.arange(400)], 400), np.arange(400)
     alone, alike = rng.normal(size=400), np.repeat(rng.normal(size=40), 10)
     narrow, wide = (drawn.median_interval(values, frames) for values in (alone, alike))
     assert narrow is not None and wide is not None and wide[1] - wide[0] > 2 * (narrow[1] - narrow[0])
-
-
-def test_values_of_few_blocks_have_no_interval() -> None:
     drawn = bootstrap_samples([np.arange(FRAMES)], FRAMES)
     few = np.arange((MIN_BLOCKS - 1) * BLOCK_FRAMES)
     assert drawn.median_interval(few.astype(float), few) is None

@@ -41,27 +41,21 @@ def test_a_box_that_is_drawn_too_long_at_its_unseen_end() -> None:
         assert errors["height"] == pytest.approx(0) and errors["turned"] == 0
 
 
-def test_the_near_side_is_the_one_that_the_sensor_sees() -> None:
+def test_the_near_side_and_left_are_those_that_the_sensor_sees() -> None:
     for y, left in ((5.0, -0.2), (-5.0, 0.2)):  # a car to the left shows its right side
         label = np.array([0.0, y, 0, 4, 2, 2, 0])
         errors = residual(np.add(label, [0, left, 0, 0, 0, 0, 0]), label)
         assert errors["near_side"] == pytest.approx(0.2) and errors["far_side"] == pytest.approx(-0.2)
         assert errors["range"] == pytest.approx(-0.2) and errors["left"] == pytest.approx(0)
-
-
-def test_left_is_left_as_the_sensor_sees_it() -> None:
     label = np.array([0.0, 10, 0, 1, 1, 2, 0.3])  # to the left of the sensor: its left is behind
     assert residual(np.add(label, [-0.2, 0, 0, 0, 0, 0, 0]), label)["left"] == pytest.approx(0.2)
 
 
-def test_headings() -> None:
+def test_headings_and_what_a_box_turned_by_a_quarter_covers() -> None:
     for turn, axis, turned in ((0.1, 0.1, 0), (np.pi + 0.1, 0.1, 1), (-0.2, -0.2, 0), (3.0, 3.0 - np.pi, 1)):
         errors = residual(np.add(CAR, [0, 0, 0, 0, 0, 0, turn]), CAR)
         assert errors["heading_deg"] == pytest.approx(np.degrees(axis)) and errors["turned"] == turned
         assert errors["length"] == pytest.approx(0)
-
-
-def test_a_box_turned_by_a_quarter_is_measured_by_what_it_covers() -> None:
     across = CAR.copy()
     across[[3, 4]], across[6] = CAR[[4, 3]], CAR[6] + np.pi / 2
     errors = residual(across, CAR)
@@ -69,7 +63,7 @@ def test_a_box_turned_by_a_quarter_is_measured_by_what_it_covers() -> None:
     assert [errors[name] for name in ("near_end", "far_end", "near_side", "far_side")] == pytest.approx([0] * 4)
 
 
-def test_residuals_and_boxes_are_one_pair() -> None:
+def test_residuals_corrections_and_boxes_are_one() -> None:
     labels, found = random_boxes(500, 0), random_boxes(500, 1)
     again = boxes_from_residuals(labels, box_residuals(found, labels))
     np.testing.assert_allclose(paired_iou_3d(again, found), 1, atol=1e-9)
@@ -78,9 +72,6 @@ def test_residuals_and_boxes_are_one_pair() -> None:
     assert 200 < same.sum() < 300
     np.testing.assert_allclose(again[same, :6], found[same, :6], atol=1e-9)
     np.testing.assert_allclose(wrap_angle(again[same, 6] - found[same, 6]), 0, atol=1e-9)
-
-
-def test_every_part_that_is_corrected_is_the_labels() -> None:
     labels = random_boxes(200, 2)
     found = labels + np.random.default_rng(3).normal(0, 0.1, labels.shape)
     errors = box_residuals(found, labels)
@@ -107,42 +98,28 @@ def test_kinds_of_detections() -> None:
     ]
     made = frame([("Car", CAR), ("Van", van), ("Cyclist", rider)], found, ignored=[False] * 5 + [True] + [False] * 2)
     objects, detections = match_frame(made, 3, "Car", 0.3)
-    assert [(item.kind, item.label) for item in detections] == [
-        ("found", ""),
-        ("duplicate", "Car"),
-        ("ignored", ""),
-        ("classification", "Cyclist"),
-        ("background", ""),
-        ("ignored", ""),
-        ("background", ""),
-    ]
+    first, others = [("found", ""), ("duplicate", "Car"), ("ignored", "")], ("background", "ignored", "background")
+    expected = [*first, ("classification", "Cyclist"), *((kind, "") for kind in others)]
+    assert [(item.kind, item.label) for item in detections] == expected
     assert [item.is_false for item in detections] == [False, True, False, True, True, False, False]
     (item,) = objects
     assert item.frame == 3 and item.found and item.score == 0.9 and item.detection is not None
 
 
-def test_a_badly_placed_box_is_false_and_its_error_counts() -> None:
-    objects, (detection,) = match_frame(
-        frame([("Car", CAR)], [("Car", 0.9, np.add(CAR, [2.5, 0, 0, 0, 0, 0, 0]))]), 0, "Car", 0.3
-    )
+def test_badly_placed_boxes_boxes_below_the_score_and_boxes_that_found_another() -> None:
+    aside = np.add(CAR, [2.5, 0, 0, 0, 0, 0, 0])
+    objects, (detection,) = match_frame(frame([("Car", CAR)], [("Car", 0.9, aside)]), 0, "Car", 0.3)
     assert (detection.kind, detection.label) == ("localization", "Car")
     assert not objects[0].found and objects[0].detection is not None and not objects[0].below_score
-
-
-def test_a_box_below_the_score_finds_nothing_and_is_told() -> None:
     far, weak = np.add(CAR, [2.5, 0, 0, 0, 0, 0, 0]), ("Car", 0.2, CAR)
     ((item,), _) = match_frame(frame([("Car", CAR)], [weak]), 0, "Car", 0.3)
     assert not item.found and item.below_score and item.detection is None and np.isnan(item.score)
     ((item,), detections) = match_frame(frame([("Car", CAR)], [weak, ("Car", 0.9, far)]), 0, "Car", 0.3)
     assert item.below_score and item.score == 0.9, "the reported box on it is measured"
     assert [one.kind for one in detections] == ["localization", "found"]
-
-
-def test_a_detection_that_found_one_object_is_on_no_other() -> None:
     behind = np.add(CAR, [3 * np.cos(0.2), 3 * np.sin(0.2), 0, 0, 0, 0, 0])  # BEV IoU 1 / 7
-    (first, second), (detection,) = match_frame(
-        frame([("Car", CAR), ("Car", behind)], [("Car", 0.9, CAR)]), 0, "Car", 0.3
-    )
+    both = frame([("Car", CAR), ("Car", behind)], [("Car", 0.9, CAR)])
+    (first, second), (detection,) = match_frame(both, 0, "Car", 0.3)
     assert first.found and detection.kind == "found"
     assert not second.found and second.detection is None
 

@@ -29,9 +29,8 @@ def walkers(count: int, wrong: np.ndarray) -> MadeFrames:
     rng, frames = np.random.default_rng(0), {}
     for number in range(count):
         label = np.add(WALKER, [rng.uniform(-3, 3), 0, 0, 0, 0, 0, 0])
-        frames[f"{number:04d}"] = frame(
-            [("Pedestrian", label)], [("Pedestrian", 0.8, label + wrong + rng.normal(0, 0.01, 7))]
-        )
+        found = [("Pedestrian", 0.8, label + wrong + rng.normal(0, 0.01, 7))]
+        frames[f"{number:04d}"] = frame([("Pedestrian", label)], found)
     return MadeFrames(frames)
 
 
@@ -67,11 +66,7 @@ def test_what_all_boxes_have_wrong_is_found_and_taken_away() -> None:
 def test_parts_stand_beside_the_whole() -> None:
     frames = walkers(60, WRONG).frames
     frames |= {f"b{frame_id}": one for frame_id, one in walkers(60, -WRONG).frames.items()}
-    parts = {
-        "a": [one for one in frames if one[0] != "b"],
-        "b": [one for one in frames if one[0] == "b"],
-        "c": ["none"],
-    }
+    parts = {name: [one for one in frames if (one[0] == "b") == (name == "b")] for name in "ab"} | {"c": ["none"]}
     matches = match_frames(MadeFrames(frames), {"Pedestrian": 0.3})
     whole, first, second = summarize(matches, "made", parts)
     assert [data.name for data in (whole, first, second)] == ["made", "a", "b"]
@@ -118,14 +113,13 @@ def test_groups() -> None:
     }
 
 
-def test_false_detections_and_the_best_score() -> None:
+def test_false_detections_the_best_score_and_thresholds_by_false_ones_a_frame() -> None:
     frames = {}
     for number in range(20):
         post = column(10, -3, 2.8)
         found = [("Pedestrian", 0.9, WALKER), ("Pedestrian", 0.5, np.add(WALKER, [-2, -3, 0, 0, 0, 0, 0]))]
-        frames[f"{number:02d}"] = frame(
-            [("Pedestrian", WALKER)], found if number % 2 else found[1:], points=np.concatenate([ground(), post])
-        )
+        points = np.concatenate([ground(), post])
+        frames[f"{number:02d}"] = frame([("Pedestrian", WALKER)], found[1 - number % 2 :], points=points)
     (data,) = summarize(match_frames(MadeFrames(frames), {"Pedestrian": 0.4}), "made", {})
     one = only(data)
     assert one.false.kinds == {"background": 20, "localization": 0, "classification": 0, "duplicate": 0}
@@ -136,21 +130,11 @@ def test_false_detections_and_the_best_score() -> None:
     assert [dataclasses.astuple(rate) for rate in one.false_rates] == [(allowed, 0.9, 0.5) for allowed in FALSE_RATES]
     everything = group(one, ALL)
     assert (everything.objects, everything.found, everything.below_score) == (20, 10, 0)
-
-
-def test_thresholds_by_false_detections_a_frame() -> None:
-    """Ten frames of one object each; a false one in every frame, of scores 0.31, 0.32, ... in turn."""
-    frames = {
-        str(number): frame(
-            [("Pedestrian", WALKER)],
-            [
-                ("Pedestrian", 0.345 if number < 8 else 0.2, WALKER),
-                ("Pedestrian", 0.31 + number / 100, np.add(WALKER, [-2, -3, 0, 0, 0, 0, 0])),
-            ],
-            points=ground(),
-        )
-        for number in range(10)
-    }
+    # Ten frames of one object each; a false one in every frame, of scores 0.31, 0.32, ... in turn.
+    frames, beside = {}, np.add(WALKER, [-2, -3, 0, 0, 0, 0, 0])
+    for number in range(10):
+        found = [("Pedestrian", 0.345 if number < 8 else 0.2, WALKER), ("Pedestrian", 0.31 + number / 100, beside)]
+        frames[str(number)] = frame([("Pedestrian", WALKER)], found, points=ground())
     (data,) = summarize(match_frames(MadeFrames(frames), {"Pedestrian": 0.3}), "made", {})
     rates = {rate.per_frame: (rate.score, rate.recall) for rate in only(data).false_rates}
     expected = {0.1: (0.4, 0.0), 0.2: (0.39, 0.0), 0.3: (0.38, 0.0), 0.5: (0.36, 0.0)}
@@ -169,10 +153,8 @@ def test_hidden_objects_say_nothing_about_their_labels() -> None:
 
 
 def test_tables_of_several_datasets() -> None:
-    sets = [
-        summarize(match_frames(walkers(60, wrong), {"Pedestrian": 0.3}), name, {})[0]
-        for name, wrong in (("real", WRONG), ("simulated", 0 * WRONG))
-    ]
+    named = (("real", WRONG), ("simulated", 0 * WRONG))
+    sets = [summarize(match_frames(walkers(60, wrong), {"Pedestrian": 0.3}), name, {})[0] for name, wrong in named]
     by_view, reaching, false, *_ = error_tables(sets)
     rows = {row[:2]: row for row in by_view.rows}
     assert [row[1] for row in by_view.rows[:2]] == ["real", "simulated"]

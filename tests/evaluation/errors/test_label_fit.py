@@ -43,20 +43,17 @@ def test_a_car_from_behind_wherever_it_stands(angle: float) -> None:
     assert np.isnan(fit["range_50"]), "of things that are seen as a whole"
 
 
-def test_from_the_front_a_roof_has_no_end() -> None:
+def test_a_roof_has_an_end_from_behind_alone_and_points_behind_the_glass_are_inside() -> None:
     front = np.add(CAR, [0, 0, 0, 0, 0, 0, np.pi])
     (behind,), (before,) = statistics(rear_of_a_car(), CAR), statistics(rear_of_a_car(), front)
     assert np.isnan(before["upper_end"]) and np.isnan(before["roof_end"])
     assert before["flank_end"] == pytest.approx(behind["flank_end"])
-
-
-def test_points_seen_through_the_glass_are_inside() -> None:
     seats = np.column_stack([np.linspace(20.3, 21, 8), np.linspace(-0.3, 0.3, 8), np.full(8, BOTTOM_M + 0.6)])
     (fit,) = statistics(np.concatenate([rear_of_a_car(), seats]), CAR)
     assert fit["low_inside"] == 1
 
 
-def test_range_of_a_person_is_that_along_the_line_of_sight() -> None:
+def test_range_of_a_person_and_the_angle_of_view() -> None:
     rng = np.random.default_rng(0)
     points = np.array([11.8, 0, -0.8]) + rng.uniform(-1, 1, (400, 3)) * (0.1, 0.2, 0.6)
     for angle in (0.0, 2.0):
@@ -65,24 +62,17 @@ def test_range_of_a_person_is_that_along_the_line_of_sight() -> None:
         assert fit["range_5"] == pytest.approx(-0.29, abs=0.02) and fit["range_95"] == pytest.approx(-0.11, abs=0.02)
         assert fit["range_spread"] == pytest.approx(0.2, abs=0.01)
         assert np.isnan(fit["flank_end"])
+    bearings, turns = np.array([0.0, 1.0, -3.0, 0.5]), np.radians([0.0, 100, 170, -30])
+    boxes = np.zeros((4, 7))
+    boxes[:, 0], boxes[:, 1], boxes[:, 6] = 10 * np.cos(bearings), 10 * np.sin(bearings), bearings + turns
+    np.testing.assert_allclose(view_angle_deg(boxes), [0, 80, 10, 30], atol=1e-6)
 
 
 def test_what_an_object_does_not_allow_is_not_a_number() -> None:
     points = rear_of_a_car()
-    far, aside, empty = (
-        np.add(CAR, [20, 0, 0, 0, 0, 0, 0]),
-        np.add(CAR, [0, 0, 0, 0, 0, 0, 0.6]),
-        np.add(CAR, [0, 9, 0, 0, 0, 0, 0]),
-    )
+    far, aside, empty = (np.add(CAR, [x, y, 0, 0, 0, 0, turn]) for x, y, turn in ((20, 0, 0), (0, 0, 0.6), (0, 9, 0)))
     fits = label_fit(points, np.array([far, aside]))
     assert np.isnan(fits).all()
     (fit,) = statistics(points, empty)
     assert np.isnan([value for name, value in fit.items() if name != "low_inside"]).all()
     assert label_fit(points, np.zeros((0, 7))).shape == (0, len(STATISTICS))
-
-
-def test_angle_of_view() -> None:
-    bearings, turns = np.array([0.0, 1.0, -3.0, 0.5]), np.radians([0.0, 100, 170, -30])
-    boxes = np.zeros((4, 7))
-    boxes[:, 0], boxes[:, 1], boxes[:, 6] = 10 * np.cos(bearings), 10 * np.sin(bearings), bearings + turns
-    np.testing.assert_allclose(view_angle_deg(boxes), [0, 80, 10, 30], atol=1e-6)

@@ -1,8 +1,9 @@
 """The KITTI protocol as plain loops over its rules, with overlaps by shapely: slow, and hard to get wrong."""
 
 import math
+from collections import namedtuple
 from functools import cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import shapely
 import shapely.affinity
@@ -14,20 +15,8 @@ OCCLUSIONS = {"easy": 0, "moderate": 1, "hard": 2}
 TRUNCATIONS = {"easy": 0.15, "moderate": 0.3, "hard": 0.5}
 NEIGHBORS = {"car": "van", "pedestrian": "person_sitting"}
 Band = tuple[float, float] | None
-
-
-class Thing(NamedTuple):
-    """One object of one frame."""
-
-    type: str
-    bbox: tuple[float, ...]
-    alpha: float
-    hwl: tuple[float, ...]
-    location: tuple[float, ...]
-    rotation_y: float
-    truncated: float
-    occluded: float
-    score: float
+Thing = namedtuple("Thing", "type bbox alpha hwl location rotation_y truncated occluded score")
+"""One object of one frame."""
 
 
 class ReferenceCurve(NamedTuple):
@@ -66,44 +55,25 @@ def brute_force(
 
 
 def things(frame: FrameObjects) -> list[Thing]:
-    rows = zip(
-        frame.bbox.tolist(),
-        frame.alpha.tolist(),
-        frame.dimensions_hwl.tolist(),
-        frame.locations.tolist(),
-        frame.rotation_y.tolist(),
-        frame.truncated.tolist(),
-        frame.occluded.tolist(),
-        frame.scores.tolist(),
-        strict=True,
-    )
+    numbers = frame.bbox, frame.alpha, frame.dimensions_hwl, frame.locations, frame.rotation_y, frame.truncated
+    rows = zip(*(part.tolist() for part in (*numbers, frame.occluded, frame.scores)), strict=True)
     return [
-        Thing(name.lower(), tuple(bbox), alpha, tuple(hwl), tuple(location), *rest)
-        for name, (bbox, alpha, hwl, location, *rest) in zip(frame.types, rows, strict=True)
+        Thing(name.lower(), *(tuple(part) if isinstance(part, list) else part for part in row))
+        for name, row in zip(frame.types, rows, strict=True)
     ]
 
 
 def curve(frames: list, name: str, metric: str, difficulty: str, band: Band) -> tuple[ReferenceCurve, ReferenceCurve]:
+    def passes(threshold: float | None) -> list[tuple[list[float], int, int, float]]:
+        return [match(truths, found, name, metric, difficulty, band, threshold) for truths, found in frames]
+
     counted = sum(truth_state(gt, name, difficulty, band) == "counted" for truths, _ in frames for gt in truths)
-    scores = []
-    for truths, found in frames:
-        scores += match(truths, found, name, metric, difficulty, band, None)[0]
+    scores = [score for matched, *_ in passes(None) for score in matched]
     thresholds = pick_thresholds(scores, counted)
-    tp: list[int] = []
-    fp: list[int] = []
-    fn: list[int] = []
-    similarity: list[float] = []
-    for threshold in thresholds:
-        for counts in (tp, fp, fn):
-            counts.append(0)
-        similarity.append(0.0)
-        for truths, found in frames:
-            matched, false, missed, similar = match(truths, found, name, metric, difficulty, band, threshold)
-            tp[-1] += len(matched)
-            fp[-1] += false
-            fn[-1] += missed
-            similarity[-1] += similar
-    rest = (counted, len(scores), thresholds, tp, fp, fn)
+    second: Any = [passes(threshold) for threshold in thresholds]
+    tp = [sum(len(one[0]) for one in each) for each in second]
+    fp, fn, similarity = ([sum(one[place] for one in each) for each in second] for place in (1, 2, 3))
+    rest: Any = (counted, len(scores), thresholds, tp, fp, fn)
     return ReferenceCurve(envelope(tp, tp, fp), *rest), ReferenceCurve(envelope(similarity, tp, fp), *rest)
 
 
@@ -114,11 +84,9 @@ def envelope(gains: list, tp: list[int], fp: list[int]) -> list[float]:
 
 
 def pick_thresholds(scores: list[float], counted: int) -> list[float]:
-    scores = sorted(scores, reverse=True)
     picked, current = [], 0.0
-    for i, score in enumerate(scores):
-        last = i == len(scores) - 1
-        if not last and (i + 2) / counted - current < current - (i + 1) / counted:
+    for i, score in enumerate(sorted(scores, reverse=True)):
+        if i < len(scores) - 1 and (i + 2) / counted - current < current - (i + 1) / counted:
             continue
         picked.append(score)
         current += 1 / 40
@@ -126,22 +94,14 @@ def pick_thresholds(scores: list[float], counted: int) -> list[float]:
 
 
 def match(
-    truths: list[Thing],
-    found: list[Thing],
-    name: str,
-    metric: str,
-    difficulty: str,
-    band: Band,
-    threshold: float | None,
+    truths: list[Thing], found: list[Thing], name: str, metric: str, difficulty: str, band: Band, least: float | None
 ) -> tuple[list[float], int, int, float]:
     """Scores of the true positives, number of false positives and of misses, and the headings' similarity."""
     overlap = {"bbox": overlap_2d, "bev": overlap_bev, "3d": overlap_3d}[metric]
     minimum = 0.7 if name == "car" else 0.5
     states = [detection_state(det, name, difficulty, band) for det in found]
-    usable = [
-        state != "absent" and (threshold is None or det.score >= threshold)
-        for det, state in zip(found, states, strict=True)
-    ]
+    pairs = zip(found, states, strict=True)
+    usable = [state != "absent" and (least is None or det.score >= least) for det, state in pairs]
     matched, missed, similar = [], 0, 0.0
     for gt in truths:
         state = truth_state(gt, name, difficulty, band)
@@ -153,7 +113,7 @@ def match(
                 continue
             if winner is None:
                 winner = j
-            elif threshold is None:
+            elif least is None:
                 winner = j if det.score > found[winner].score else winner
             elif states[j] == "counted" and (
                 states[winner] == "ignored" or overlap(det, gt) > overlap(found[winner], gt)
@@ -169,19 +129,17 @@ def match(
     areas = [gt for gt in truths if gt.type == "dontcare"]
     false = 0
     for det, state, left in zip(found, states, usable, strict=True):
-        excused = metric == "bbox" and any(share_2d(det, area) > minimum for area in areas)
+        excused = metric == "bbox" and any(shared_2d(det, area) / area_2d(det) > minimum for area in areas)
         false += left and state == "counted" and not excused
     return matched, false, missed, similar
 
 
 def truth_state(gt: Thing, name: str, difficulty: str, band: Band) -> str:
-    if gt.type == NEIGHBORS.get(name):
-        return "ignored"
-    if gt.type != name:
+    if gt.type not in (name, NEIGHBORS.get(name)):
         return "absent"
     low = gt.bbox[3] - gt.bbox[1] < HEIGHTS[difficulty]
     hidden = gt.occluded > OCCLUSIONS[difficulty] or gt.truncated > TRUNCATIONS[difficulty]
-    return "ignored" if low or hidden or outside(gt, band) else "counted"
+    return "ignored" if gt.type != name or low or hidden or outside(gt, band) else "counted"
 
 
 def detection_state(det: Thing, name: str, difficulty: str, band: Band) -> str:
@@ -197,23 +155,17 @@ def outside(thing: Thing, band: Band) -> bool:
 
 
 def shared_2d(a: Thing, b: Thing) -> float:
-    width = min(a.bbox[2], b.bbox[2]) - max(a.bbox[0], b.bbox[0])
-    height = min(a.bbox[3], b.bbox[3]) - max(a.bbox[1], b.bbox[1])
+    width, height = (min(a.bbox[i + 2], b.bbox[i + 2]) - max(a.bbox[i], b.bbox[i]) for i in (0, 1))
     return width * height if width > 0 and height > 0 else 0.0
 
 
 def area_2d(a: Thing) -> float:
-    return (a.bbox[2] - a.bbox[0]) * (a.bbox[3] - a.bbox[1])
+    return (a.bbox[2] - a.bbox[0]) * (a.bbox[3] - a.bbox[1]) or math.inf  # that of a box of -1 everywhere is 0
 
 
 def overlap_2d(det: Thing, gt: Thing) -> float:
     shared = shared_2d(det, gt)
-    return shared / (area_2d(det) + area_2d(gt) - shared) if shared else 0.0
-
-
-def share_2d(det: Thing, area: Thing) -> float:
-    shared = shared_2d(det, area)
-    return shared / area_2d(det) if shared else 0.0
+    return shared / (area_2d(det) + area_2d(gt) - shared)
 
 
 @cache

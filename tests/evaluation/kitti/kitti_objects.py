@@ -12,9 +12,7 @@ from asca_pillars.evaluation.kitti.objects import FrameObjects, frame_objects
 # 60 pixels high, unoccluded: counted at every difficulty.
 CAR = KittiObject("Car", 0.0, 0, 0.3, (100.0, 100.0, 200.0, 160.0), 1.5, 1.6, 3.9, 2.0, 1.7, 20.0, 0.4)
 DONT_CARE = KittiObject("DontCare", -1, -1, -10, (100.0, 100.0, 200.0, 160.0), -1, -1, -1, -1000, -1000, -1000, -10)
-
-ON_GROUND = ("bev", "3d")
-EVERY = ("bbox", *ON_GROUND)
+EVERY = ("bbox", "bev", "3d")
 CLASSES = ("Car", "Pedestrian", "Cyclist")
 Frame = list[KittiObject]
 
@@ -56,11 +54,6 @@ def shifted(item: KittiObject, share: float, **changes: Any) -> KittiObject:
     """Moved to the right in the image by a share of the width: IoU (1 - share) / (1 + share). The 3D box stays."""
     x1, y1, x2, y2 = item.bbox
     return replace(item, bbox=(x1 + share * (x2 - x1), y1, x2 + share * (x2 - x1), y2), **changes)
-
-
-def low(item: KittiObject, height_px: float, **changes: Any) -> KittiObject:
-    x1, y1, x2, _ = item.bbox
-    return replace(item, bbox=(x1, y1, x2, y1 + height_px), **changes)
 
 
 def random_frames(seed: int, frames: int, detections: int) -> tuple[list[FrameObjects], list[FrameObjects]]:

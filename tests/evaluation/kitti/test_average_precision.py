@@ -87,16 +87,8 @@ def test_equals_plain_loops(
     assert curves.keys() == references.keys()
     for key, reference in references.items():
         curve = curves[key]
-        assert (curve.counted, curve.matched, curve.thresholds.tolist()) == (
-            reference.counted,
-            reference.matched,
-            reference.thresholds,
-        )
-        assert [curve.tp.tolist(), curve.fp.tolist(), curve.fn.tolist()] == [
-            reference.tp,
-            reference.fp,
-            reference.fn,
-        ], key
+        lists = [part.tolist() for part in (curve.thresholds, curve.tp, curve.fp, curve.fn)]
+        assert [curve.counted, curve.matched, *lists] == list(reference[1:]), key
         np.testing.assert_allclose(curve.precision, reference.precision, rtol=0, atol=1e-12)
 
 
@@ -123,7 +115,7 @@ def assert_perfect(curve: Curve) -> None:
     assert not len(curve.fp) or (curve.fp[-1], curve.fn[-1]) == (0, 0)
 
 
-@pytest.mark.parametrize("objects", [0, 1, 2, 4, 5, 39, 40, 41, 42, 57, 79, 80, 81, 200, 333])
+@pytest.mark.parametrize("objects", [0, 1, 4, 5, 40, 41, 80, 81, 200])
 @pytest.mark.parametrize("equal_scores", [False, True])
 def test_labels_find_themselves(objects: int, equal_scores: bool) -> None:
     """Whoever finds everything gets the cap, which is below 100 for 40 objects or fewer; AOS is as good as 2D."""

@@ -3,6 +3,7 @@
 import dataclasses
 import io
 import json
+from functools import cache
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from rich.console import Console
 from asca_pillars.data.kitti import KittiObject
 from asca_pillars.evaluation.kitti.average_precision import DIFFICULTIES, METRICS, evaluate
 from asca_pillars.evaluation.kitti.kitti_report import BANDS_M, KittiReport, kitti_json, kitti_notes, kitti_tables
-from asca_pillars.evaluation.kitti.objects import frame_objects
+from asca_pillars.evaluation.kitti.objects import FrameObjects, frame_objects
 from asca_pillars.evaluation.kitti.operating_point import best_scores, operating_points
 from asca_pillars.evaluation.predictions import ScoredFrames
 from asca_pillars.evaluation.report_page import ReportPage
@@ -25,6 +26,7 @@ def car(x_m: float, z_m: float, score: float | None = None) -> KittiObject:
     return KittiObject("Car", 0, 0, 0.1, (left, 150, left + 8, 200), 1.5, 1.6, 3.9, x_m, 1.7, z_m, 0.1, score)
 
 
+@cache
 def report(cars: int = 12, missing: tuple[str, ...] = ()) -> KittiReport:
     """Frames of one car each, every second one 45 m away, all found."""
     places = [(float(index), 45.0 if index % 2 else 20.0) for index in range(cars)]
@@ -59,16 +61,13 @@ def test_average_precision_with_counts_and_dashes() -> None:
     assert rows["Cyclist", "objects"] == ("-",) * 6
 
 
-def test_bands_give_the_mean_and_the_counted_objects() -> None:
+def test_tables_of_bands_recall_and_precision() -> None:
     table = kitti_tables(report())[1]
     assert "R40, moderate" in table.title and "Table 4 of ASCA" in table.title and "Deformable PV-RCNN" in table.title
     rows = {row[0]: row[1:] for row in table.rows}
     # Six cars on either side of 40 m: 5/40. None between 30 and 40 m.
     assert rows["0-40 m"] == ("12.50", "12.50 (6)", "-", "-")
     assert rows["40-80 m"] == rows["30-50 m"] == rows["0-30 m"] == rows["0-40 m"]
-
-
-def test_recall_and_precision_have_intervals() -> None:
     recall, precision = cells(report(), 2), cells(report(), 3)
     # Wilson for 12 of 12: 1 / (1 + 1.96^2 / 12) = 0.7575 at the lower end.
     assert recall["Car", "moderate"] == precision["Car", "moderate"] == ("12", "12", "100.00", "75.75 - 100.00")
@@ -76,26 +75,38 @@ def test_recall_and_precision_have_intervals() -> None:
     assert "Car 0.5 (IoU 0.7)" in kitti_tables(report())[2].title
 
 
-def test_small_sets_and_missing_classes_are_named() -> None:
+def test_small_sets_missing_classes_and_markdown() -> None:
     lines = kitti_notes(report())
     assert "Car moderate: only 12 counted objects; a perfect detector gets at most 27.5 R40, 27.3 R11" in lines
     assert "Cyclist: not evaluated, because nothing was detected as one; the means leave the class out" in lines
     assert not any(line.startswith("Car") for line in kitti_notes(report(cars=41)))
     assert any(line.startswith("Car easy: only 40 ") for line in kitti_notes(report(cars=40)))
     assert lines[-1].endswith("in 3D: Car 0.89")  # the last of twelve found, with scores 1.00, 0.99 ...
+    lines = page(report()).markdown().splitlines()
+    assert "| class | metric | R40 easy | R40 moderate | R40 hard | R11 easy | R11 moderate | R11 hard |" in lines
+    widths: list[int] = []
+    for line in lines:
+        if line.startswith("|"):
+            widths.append(line.count("|"))
+        elif widths:
+            assert len(set(widths)) == 1 and len(widths) > 3
+            widths = []
+    assert "- Car easy: only 12 counted objects; a perfect detector gets at most 27.5 R40, 27.3 R11" in lines
 
 
 def test_ignored_detections_are_named_where_they_are_most() -> None:
     """KITTI's tool ignores detections without a 2D box for their lack of height: a precision of 100 % says nothing."""
     made = report()
+
+    def hidden(detections: list[FrameObjects]) -> list[str]:
+        points = operating_points(made.frames.truth, detections, CLASSES, scores=0.5, difficulties=DIFFICULTIES)
+        notes = kitti_notes(dataclasses.replace(made, points=points))
+        return [line for line in notes if "are ignored" in line]
+
     flat = [dataclasses.replace(frame, bbox=np.full((1, 4), -1.0)) for frame in made.frames.detections]
-    points = operating_points(made.frames.truth, flat, CLASSES, scores=0.5, difficulties=DIFFICULTIES)
-    hidden = [line for line in kitti_notes(dataclasses.replace(made, points=points)) if "are ignored" in line]
-    assert not any("are ignored" in line for line in kitti_notes(made))
-    far = [dataclasses.replace(frame, locations=frame.locations + 50) for frame in flat]
-    points = operating_points(made.frames.truth, far, CLASSES, scores=0.5, difficulties=DIFFICULTIES)
-    hidden += [line for line in kitti_notes(dataclasses.replace(made, points=points)) if "are ignored" in line]
-    assert len(hidden) == 1 and hidden[0].startswith("Car: 12 of 12 detections are ignored even at hard")
+    assert hidden(list(made.frames.detections)) == hidden(flat) == []
+    (line,) = hidden([dataclasses.replace(frame, locations=frame.locations + 50) for frame in flat])
+    assert line.startswith("Car: 12 of 12 detections are ignored even at hard")
 
 
 def test_missing_frames_stand_in_every_form_of_the_report() -> None:
@@ -153,16 +164,3 @@ def test_the_json_has_kittis_shape_and_no_nan() -> None:
     }
     assert len(by_class) == 9 and by_class["Car", "easy"]["found"] == 12
     assert by_class["Cyclist", "easy"]["recall"] is None
-
-
-def test_the_markdown_tables_are_whole() -> None:
-    lines = page(report()).markdown().splitlines()
-    assert "| class | metric | R40 easy | R40 moderate | R40 hard | R11 easy | R11 moderate | R11 hard |" in lines
-    widths: list[int] = []
-    for line in lines:
-        if line.startswith("|"):
-            widths.append(line.count("|"))
-        elif widths:
-            assert len(set(widths)) == 1 and len(widths) > 3
-            widths = []
-    assert "- Car easy: only 12 counted objects; a perfect detector gets at most 27.5 R40, 27.3 R11" in lines

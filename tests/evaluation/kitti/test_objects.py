@@ -9,7 +9,7 @@ from asca_pillars.evaluation.kitti.objects import FrameObjects, concatenate_fram
 from tests.evaluation.kitti.kitti_objects import CAR, DONT_CARE
 
 
-def test_every_field_goes_where_it_belongs() -> None:
+def test_every_field_goes_where_it_belongs_in_order() -> None:
     frame = frame_objects("000007", [DONT_CARE, replace(CAR, truncated=0.15, occluded=2, score=-1.5)])
     assert frame.frame_id == "000007" and frame.types == ("DontCare", "Car") and len(frame) == 2
     assert frame.bbox.tolist() == [list(DONT_CARE.bbox), list(CAR.bbox)]
@@ -20,26 +20,6 @@ def test_every_field_goes_where_it_belongs() -> None:
     assert frame.truncated.tolist() == [-1, 0.15]
     assert frame.occluded.tolist() == [-1, 2]
     assert frame.scores.tolist() == [0, -1.5]
-
-
-def test_nothing_has_the_shapes_of_nothing() -> None:
-    frame = frame_objects("000000", [])
-    assert len(frame) == 0
-    assert frame.bbox.shape == (0, 4) and frame.dimensions_hwl.shape == (0, 3) and frame.scores.shape == (0,)
-    assert len(concatenate_frames([])) == 0 and len(concatenate_frames([frame, frame])) == 0
-
-
-def test_distance_is_horizontal_and_from_the_camera() -> None:
-    frame = frame_objects("000000", [replace(CAR, x_m=-3.0, y_m=50.0, z_m=4.0)])
-    assert frame.distances_m.tolist() == [5.0]
-
-
-def test_types_fold_their_case() -> None:
-    frame = frame_objects("000000", [replace(CAR, type="PERSON_sitting"), CAR])
-    assert frame.folded_types.tolist() == ["person_sitting", "car"]
-
-
-def test_stacking_keeps_the_order() -> None:
     first = frame_objects("000000", [CAR, DONT_CARE])
     second = frame_objects("000001", [replace(CAR, type="Van", x_m=9.0)])
     both = concatenate_frames([first, second])
@@ -47,6 +27,10 @@ def test_stacking_keeps_the_order() -> None:
     for field in fields(FrameObjects)[2:]:
         parts = [getattr(first, field.name), getattr(second, field.name)]
         np.testing.assert_array_equal(getattr(both, field.name), np.concatenate(parts))
+    frame = frame_objects("000000", [])
+    assert len(frame) == 0
+    assert frame.bbox.shape == (0, 4) and frame.dimensions_hwl.shape == (0, 3) and frame.scores.shape == (0,)
+    assert len(concatenate_frames([])) == 0 and len(concatenate_frames([frame, frame])) == 0
 
 
 @pytest.mark.parametrize(

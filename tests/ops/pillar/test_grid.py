@@ -4,7 +4,7 @@ import re
 
 import numpy as np
 import pytest
-from hypothesis import assume, given
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from asca_pillars.base.errors import ConfigError
@@ -39,43 +39,28 @@ def test_default_is_the_papers_grid() -> None:
     np.testing.assert_allclose(np.diff(grid.y_edges_m), 0.16)
 
 
+@settings(max_examples=60)
 @given(grids())
-def test_depths_follow_equations_1_to_5(grid: PillarGrid) -> None:
+def test_columns_follow_equations_1_to_5_and_fill_the_ranges(grid: PillarGrid) -> None:
     d_min, d_max = grid.x_range_m
-    near = grid.x_edges_m[:-1]
+    near, depths = grid.x_edges_m[:-1], np.diff(grid.x_edges_m)
     a = (near - d_min) / (d_max - d_min)  # eq. 3-5 for the near edge of each column
     n = np.floor(a * grid.zones + 1e-9) + 1  # eq. 2
-    np.testing.assert_allclose(np.diff(grid.x_edges_m), grid.v_max_m / 2 ** (n - 1), rtol=1e-6)  # eq. 1
-
-
-@given(grids())
-def test_ranges_are_filled_exactly(grid: PillarGrid) -> None:
+    np.testing.assert_allclose(depths, grid.v_max_m / 2 ** (n - 1), rtol=1e-6)  # eq. 1
     for edges, span, count in ((grid.x_edges_m, grid.x_range_m, grid.nx), (grid.y_edges_m, grid.y_range_m, grid.ny)):
         assert edges.shape == (count + 1,) and edges.dtype == np.float64
-        assert (edges[0], edges[-1]) == span
-        assert (np.diff(edges) > 0).all()
-        assert count % NECK_STRIDE == 0
-
-
-@given(grids())
-def test_head_cells_are_two_equal_columns_wide(grid: PillarGrid) -> None:
-    depths = np.diff(grid.x_edges_m).reshape(-1, HEAD_STRIDE)
-    np.testing.assert_allclose(depths[:, 0], depths[:, 1])  # no zone border inside
+        assert (edges[0], edges[-1]) == span and (np.diff(edges) > 0).all() and count % NECK_STRIDE == 0
+    # Head cells are two equal columns wide: no zone border lies inside.
+    np.testing.assert_allclose(*depths.reshape(-1, HEAD_STRIDE).T)
     x, y = grid.head_centers_m()
     assert (len(y), len(x)) == grid.head_shape
-    cells = np.arange(grid.nx * grid.ny).reshape(grid.ny, grid.nx)
-    centers = grid.cell_centers_m(cells.ravel()).reshape(*cells.shape, 2).astype(np.float64)
-    np.testing.assert_allclose(x, centers[0, :, 0].reshape(-1, 2).mean(axis=1), atol=1e-5)
-    np.testing.assert_allclose(y, centers[:, 0, 1].reshape(-1, 2).mean(axis=1), atol=1e-5)
-
-
-@given(grids())
-def test_a_pillars_center_lies_in_the_pillar(grid: PillarGrid) -> None:
     cells = np.arange(grid.nx * grid.ny)
     centers = grid.cell_centers_m(cells)
     assert centers.dtype == np.float32
-    z = np.full((len(cells), 1), -1.0, np.float32)
-    np.testing.assert_array_equal(grid.cells(np.hstack([centers, z])), cells)
+    np.testing.assert_array_equal(grid.cells(np.insert(centers, 2, -1.0, axis=1)), cells)
+    rows, columns = np.moveaxis(centers.reshape(grid.ny, grid.nx, 2).astype(np.float64), 2, 0)[::-1]
+    np.testing.assert_allclose(x, columns[0].reshape(-1, 2).mean(axis=1), atol=1e-5)
+    np.testing.assert_allclose(y, rows[:, 0].reshape(-1, 2).mean(axis=1), atol=1e-5)
 
 
 def cells_by_search(grid: PillarGrid, points: np.ndarray) -> list[int]:
@@ -92,6 +77,7 @@ def cells_by_search(grid: PillarGrid, points: np.ndarray) -> list[int]:
     return result
 
 
+@settings(max_examples=60)
 @given(grids(), st.integers(0, 2**32 - 1))
 def test_cells_equal_a_search_of_the_borders(grid: PillarGrid, seed: int) -> None:
     rng = np.random.default_rng(seed)

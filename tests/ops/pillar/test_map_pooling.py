@@ -20,7 +20,7 @@ def random_pillars(grid: PillarGrid, share: float) -> tuple[np.ndarray, np.ndarr
 
 
 @pytest.mark.parametrize("zones", [2, 3, 4, 5])
-@pytest.mark.parametrize("share", [0.02, 0.5, 1.0])
+@pytest.mark.parametrize("share", [0.02, 1.0])
 def test_every_cell_has_the_largest_values_of_the_pillars_on_it(zones: int, share: float) -> None:
     grid = pooled_grid(zones)
     features, cells = random_pillars(grid, share)
@@ -45,11 +45,15 @@ def test_the_map_is_that_of_uniform_pillars() -> None:
         np.testing.assert_allclose(ours, theirs, atol=1e-9)
 
 
-def test_one_zone_and_a_warped_map_stay_as_they_are() -> None:
+def test_maps_that_stay_as_they_are_and_no_pillars() -> None:
     for grid in (PillarGrid(zones=1, v_max_m=0.16, map="pooled"), PillarGrid()):
         features, cells = random_pillars(grid, 0.01)
         assert grid.map_shape == (grid.ny, grid.nx) and map_cells(cells, grid) is None
         assert pool_pillars(features, cells, grid)[0] is features
+    grid = pooled_grid(3)
+    pooled, occupied = pool_pillars(np.empty((0, 5), np.float32), np.empty(0, np.int64), grid)
+    assert pooled.shape == (0, 5) and occupied.shape == (0,)
+    assert dataclasses.replace(grid, map="warped").map_shape == (grid.ny, grid.nx)
 
 
 def test_steps_may_be_pooled_in_place_of_values() -> None:
@@ -57,13 +61,5 @@ def test_steps_may_be_pooled_in_place_of_values() -> None:
     features, cells = random_pillars(grid, 0.7)
     steps = np.clip(np.round(features * 40 + 120), 0, 255).astype(np.uint8)
     pooled, _ = pool_pillars(features, cells, grid)
-    np.testing.assert_array_equal(
-        pool_pillars(steps, cells, grid)[0], np.clip(np.round(pooled * 40 + 120), 0, 255).astype(np.uint8)
-    )
-
-
-def test_no_pillars() -> None:
-    grid = pooled_grid(3)
-    pooled, occupied = pool_pillars(np.empty((0, 5), np.float32), np.empty(0, np.int64), grid)
-    assert pooled.shape == (0, 5) and occupied.shape == (0,)
-    assert dataclasses.replace(grid, map="warped").map_shape == (grid.ny, grid.nx)
+    expected = np.clip(np.round(pooled * 40 + 120), 0, 255).astype(np.uint8)
+    np.testing.assert_array_equal(pool_pillars(steps, cells, grid)[0], expected)

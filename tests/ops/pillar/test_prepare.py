@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from asca_pillars.base.errors import ConfigError
@@ -47,6 +47,7 @@ def assert_consistent(pillars: Pillars, points: np.ndarray, grid: PillarGrid) ->
         np.testing.assert_allclose(inside[:, 7:], inside[:, :2] - grid.cell_centers_m(cell[None]), atol=1e-5)
 
 
+@settings(max_examples=40)
 @given(
     st.integers(0, 2**32 - 1),
     st.integers(0, 300),
@@ -65,6 +66,7 @@ def test_equals_a_dictionary_of_lists(seed: int, count: int, spread_m: float, gr
     assert_consistent(pillars, points, grid)
 
 
+@settings(max_examples=40)
 @given(st.integers(0, 2**32 - 1), st.integers(1, 30), st.integers(1, 8))
 def test_limits_keep_a_subset(seed: int, max_pillars: int, max_points: int) -> None:
     points = cloud(seed, 400, 0.5)
@@ -85,16 +87,6 @@ def test_limits_keep_a_subset(seed: int, max_pillars: int, max_points: int) -> N
     before = points.copy()
     pillars.features[:] = 0
     np.testing.assert_array_equal(points, before)
-
-
-def test_every_part_of_a_crowd_keeps_its_share() -> None:
-    # Ten pillars along x of ten points each; half of the pillars and three points of each are kept.
-    points = np.zeros((100, 4), np.float32)
-    points[:, 0] = 2.16 + 0.32 * np.repeat(np.arange(10), 10)
-    points[:, 3] = np.arange(100) / 100
-    pillars = pillarize(points, GRID, PillarLimits(5, 3))
-    kept = np.round(pillars.features[:, 3] * 100).astype(int)
-    assert kept.reshape(5, 3).tolist() == [[10 * pillar + place for place in (3, 6, 9)] for pillar in (1, 3, 5, 7, 9)]
 
 
 @given(st.integers(1, 500), st.integers(1, 600))

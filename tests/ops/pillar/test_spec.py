@@ -20,14 +20,11 @@ SPEC = PillarSpec(
 )
 
 
-def test_pillarize_uses_the_specs_grid_and_limits() -> None:
+def test_the_specs_grid_limits_and_anchors_are_used() -> None:
     points = np.random.default_rng(0).uniform((2, -3, -2, 0), (17, 7, 1, 1), (200, 4)).astype(np.float32)
     pillars = SPEC.pillarize(points)
     assert pillars.stats.pillars == 20
     np.testing.assert_array_equal(pillars.features, pillarize(points, SPEC.grid, SPEC.limits).features)
-
-
-def test_decode_uses_the_specs_anchors() -> None:
     height, width = SPEC.grid.head_shape
     maps = HeadMaps(*(np.zeros((channels, height, width), np.float32) for channels in (4, 28, 8)))
     maps.scores[:] = -10
@@ -38,20 +35,25 @@ def test_decode_uses_the_specs_anchors() -> None:
     np.testing.assert_allclose(detections.boxes, SPEC.anchors[5, 9, 2][None], atol=1e-6)
 
 
-def test_anchors_are_made_once_and_read_only() -> None:
+def test_anchors_are_made_once_and_thresholds_set_for_all_or_by_name() -> None:
     assert SPEC.anchors is SPEC.anchors
     np.testing.assert_array_equal(SPEC.anchors, make_anchors(*SPEC.head_centers_m(), SPEC.classes))
     with pytest.raises(ValueError, match="read-only"):
         SPEC.anchors[0] = 0
+    both = SPEC.with_score_threshold(0.11)
+    assert [spec.score_threshold for spec in both.classes] == [0.11, 0.11]
+    one = both.with_score_threshold({"Pedestrian": 0.5})
+    assert [spec.score_threshold for spec in one.classes] == [0.11, 0.5]
+    with pytest.raises(ConfigError, match="Tram: no such class; there are Car, Pedestrian"):
+        SPEC.with_score_threshold({"Tram": 0.5})
+    with pytest.raises(ConfigError, match="score_threshold 2 of class Car"):
+        SPEC.with_score_threshold({"Car": 2.0})
 
 
-def test_direction_bins_begin_within_half_a_turn() -> None:
+def test_impossible_directions_and_classes_are_refused() -> None:
     assert PillarSpec(direction_offset_rad=-np.pi).direction_offset_rad == -np.pi
     with pytest.raises(ConfigError, match="direction_offset_rad -90 must lie between -pi and pi; it is in radians"):
         PillarSpec(direction_offset_rad=-90)
-
-
-def test_classes_must_exist_and_differ() -> None:
     with pytest.raises(ConfigError, match="at least one class"):
         PillarSpec(classes=())
     with pytest.raises(ConfigError, match="Car, Car"):
@@ -63,14 +65,3 @@ def test_geometry_needs_numpy_alone() -> None:
     code = f"import sys, asca_pillars.ops.pillar.spec; print([m for m in {heavy} if m in sys.modules])"
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert result.stdout.strip() == "[]"
-
-
-def test_score_thresholds_are_set_for_all_or_by_name() -> None:
-    both = SPEC.with_score_threshold(0.11)
-    assert [spec.score_threshold for spec in both.classes] == [0.11, 0.11]
-    one = both.with_score_threshold({"Pedestrian": 0.5})
-    assert [spec.score_threshold for spec in one.classes] == [0.11, 0.5]
-    with pytest.raises(ConfigError, match="Tram: no such class; there are Car, Pedestrian"):
-        SPEC.with_score_threshold({"Tram": 0.5})
-    with pytest.raises(ConfigError, match="score_threshold 2 of class Car"):
-        SPEC.with_score_threshold({"Car": 2.0})

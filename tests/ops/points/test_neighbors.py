@@ -1,5 +1,7 @@
 """Balls, nearest points and the cells of cubes against all distances."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -10,6 +12,7 @@ from tests.ops.numpy_kernels import by_numpy
 from tests.ops.points.clouds import CLOUDS, squared_distances
 
 
+@settings(max_examples=40)
 @given(CLOUDS, CLOUDS, st.sampled_from([0.05, 0.4, 1.0, 2.5, 50.0]), st.integers(1, 20))
 def test_balls(points: np.ndarray, queries: np.ndarray, radius_m: float, samples: int) -> None:
     found = ball_query(points, queries, radius_m, samples)
@@ -34,6 +37,7 @@ def test_a_full_ball_is_not_filled_from_one_side() -> None:
     assert quadrants.min() > 0
 
 
+@settings(max_examples=50)
 @given(CLOUDS, CLOUDS)
 def test_three_nearest(points: np.ndarray, queries: np.ndarray) -> None:
     indices, weights = three_nearest(points, queries)
@@ -47,7 +51,7 @@ def test_three_nearest(points: np.ndarray, queries: np.ndarray) -> None:
 
 
 @given(CLOUDS, CLOUDS, st.sampled_from([0.05, 0.8, 1.6, 40.0]), st.integers(1, 3))
-@settings(max_examples=40)
+@settings(max_examples=30)
 def test_nearest_in_cubes(points: np.ndarray, queries: np.ndarray, half_length_m: float, cells: int) -> None:
     queries = queries[:8]
     found = nearest_in_cubes(points, queries, half_length_m, cells)
@@ -71,10 +75,8 @@ def test_cells_of_a_cube() -> None:
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
 def test_what_has_no_place_is_refused(bad: float) -> None:
     place, nowhere = np.zeros((1, 3)), np.array([[0, bad, 0]])
-    for points, queries in ((nowhere, place), (place, nowhere)):
-        with pytest.raises(ValueError, match="finite"):
-            ball_query(points, queries, 0.8, 3)
-        with pytest.raises(ValueError, match="finite"):
-            three_nearest(points, queries)
-        with pytest.raises(ValueError, match="finite"):
-            nearest_in_cubes(points, queries, 0.8, 3)
+    searches: tuple[tuple[Any, ...], ...] = ((ball_query, 0.8, 3), (three_nearest,), (nearest_in_cubes, 0.8, 3))
+    for search, *more in searches:
+        for points, queries in ((nowhere, place), (place, nowhere)):
+            with pytest.raises(ValueError, match="finite"):
+                search(points, queries, *more)

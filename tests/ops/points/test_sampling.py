@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import shapely
 import torch
-from hypothesis import example, given
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from asca_pillars.ops.points.sampling import bilinear_cells, farthest_points, points_near_boxes, read_map
@@ -25,6 +25,7 @@ def plain(points: np.ndarray, count: int) -> list[int]:
     return chosen
 
 
+@settings(max_examples=40)
 @given(CLOUDS, st.integers(0, 40))
 @example(STRAY, 20)
 @example(np.repeat(cloud(0, 30, 5.0, coarse=False), 3, axis=0), 1000)  # every position once
@@ -50,6 +51,7 @@ def near_circles(points: np.ndarray, boxes: np.ndarray, margin_m: float) -> np.n
     return points[(dx * dx + dy * dy < reach * reach).any(axis=1)]
 
 
+@settings(max_examples=40)
 @given(st.integers(0, 2**32 - 1), st.integers(0, 6), st.floats(0, 5), st.sampled_from([0.0, 60.0, 3e4, 1e7]))
 def test_points_near_boxes(seed: int, count: int, margin_m: float, offset_m: float) -> None:
     rng = np.random.default_rng(seed)

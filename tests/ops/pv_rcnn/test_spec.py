@@ -8,15 +8,12 @@ from asca_pillars.ops.pv_rcnn.spec import VoxelSpec
 from asca_pillars.ops.pv_rcnn.voxels import VoxelGrid, voxelize
 
 
-def test_the_published_lattices() -> None:
+def test_lattices_that_are_published_and_a_finer_one() -> None:
     spec = VoxelSpec()
     assert spec.level_shapes == ((41, 1600, 1408), (21, 800, 704), (11, 400, 352), (5, 200, 176), (2, 200, 176))
     assert spec.map_stride == 8 and spec.anchors.shape == (200, 176, 6, 7)
     x, y = spec.head_centers_m()
     assert (x[0], x[-1], y[0], y[-1]) == (0.0, 70.4, -40.0, 40.0), "both ends included"
-
-
-def test_a_map_of_finer_cells() -> None:
     spec = VoxelSpec(
         grid=VoxelGrid((0.0, 6.4), (-3.2, 3.2), size_m=(0.1, 0.1, 0.1)), last_stride=1, anchor_places="cells"
     )

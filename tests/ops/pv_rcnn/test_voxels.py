@@ -43,7 +43,7 @@ def held(points: np.ndarray, grid: VoxelGrid) -> dict[int, list[np.ndarray]]:
     return found
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=50)
 @given(
     st.integers(0, 2**32 - 1),
     st.sampled_from([0, 1, 50, 300]),
@@ -65,7 +65,7 @@ def test_voxels_hold_the_mean_of_their_first_points(seed: int, count: int, sprea
     assert inside.all()
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=40)
 @given(st.integers(1, 9000), st.sampled_from([0.01, 0.03, 0.05, 0.1, 0.16]), st.floats(-200, 200))
 @example(17, 0.01, 0.0)  # its quotient rounds up to the range's end
 def test_the_last_point_of_a_range_is_in_its_last_voxel(count: int, size_m: float, low_m: float) -> None:

@@ -27,7 +27,7 @@ SHAPES = ((5, 8, 6), (1, 9, 4), (3, 3, 3), (63, 4, 3))
 seeds, shares = st.integers(0, 2**32 - 1), st.sampled_from([0.0, 0.02, 0.3, 1.0])
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=80, deadline=None)
 @given(seeds, shares, shares, st.sampled_from(SHAPES), st.sampled_from(CONVOLUTIONS))
 def test_a_convolution_by_table_is_the_dense_one(
     seed: int, share: float, earlier: float, shape: Shape, conv: Convolution

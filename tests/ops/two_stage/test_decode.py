@@ -21,17 +21,16 @@ def refined(boxes: np.ndarray, to: np.ndarray, labels: list[int], scores: list[f
     return refined_detections(proposals, np.array(scores, np.float32), encode_refinement(to, boxes), POST)
 
 
-def test_boxes_move_and_new_scores_order_them() -> None:
+def test_boxes_move_and_what_comes_to_the_same_place_is_found_once() -> None:
     found = refined(at(10, 30, 50), at(11, 31, 51), [0, 0, 1], [0.2, 0.9, 0.6])
     np.testing.assert_allclose(found.boxes, at(31, 51, 11), atol=1e-5)
     np.testing.assert_allclose(found.scores, [0.9, 0.6, 0.2])
     assert found.names == ["Car", "Cyclist", "Car"]
-
-
-def test_what_comes_to_the_same_place_is_found_once_in_each_class() -> None:
     found = refined(at(10, 12, 10, 40, 60), at(11, 11, 11, 40, 60), [0, 0, 1, 0, 0], [0.3, 0.8, 0.7, 0.2, 0.1])
     np.testing.assert_allclose(found.boxes, at(11, 11, 40), atol=1e-5)
     assert found.labels.tolist() == [0, 1, 0], "three at most"
+    scores, residuals = np.empty(0, np.float32), np.empty((0, 7), np.float32)
+    assert len(refined_detections(Detections.empty(NAMES), scores, residuals, POST)) == 0
 
 
 def test_what_is_not_finite_in_either_stage_is_counted() -> None:
@@ -50,16 +49,13 @@ def test_what_is_not_finite_in_either_stage_is_counted() -> None:
     assert found.non_finite == 7 + 2
 
 
-def test_scores_of_both_stages_are_their_geometric_mean() -> None:
+def test_scores_of_both_stages_and_their_thresholds() -> None:
     proposals = Detections(at(10, 30), np.array([0.4, 0.9], np.float32), np.zeros(2, np.int64), NAMES)
     confidence = np.array([2.0, -1.0], np.float32)
     own = 1 / (1 + np.exp(-confidence))
     np.testing.assert_allclose(refined_scores(proposals, confidence, "second"), own, rtol=1e-6)
     np.testing.assert_allclose(refined_scores(proposals, confidence, "both"), np.sqrt(own * [0.4, 0.9]), rtol=1e-6)
-
-
-def test_thresholds_are_of_the_scores_that_are_reported() -> None:
-    """The second stage would keep the first box alone, its proposals' scores the other one."""
+    # The second stage would keep the first box alone, its proposals' scores the other one.
     spec = PvRcnnModel().spec.with_score_threshold(0.5)
     labels, places = np.zeros(2, np.int64), at(10, 30)
     proposals = Detections(places, np.array([0.2, 0.9], np.float32), labels, spec.class_names)
@@ -69,8 +65,3 @@ def test_thresholds_are_of_the_scores_that_are_reported() -> None:
     np.testing.assert_allclose(second.boxes, places[:1], atol=1e-5)
     np.testing.assert_allclose(both.boxes, places[1:], atol=1e-5)
     np.testing.assert_allclose(both.scores, np.sqrt(0.9 / (1 + np.exp(0.5))), rtol=1e-6)
-
-
-def test_no_proposals() -> None:
-    scores, residuals = np.empty(0, np.float32), np.empty((0, 7), np.float32)
-    assert len(refined_detections(Detections.empty(NAMES), scores, residuals, POST)) == 0

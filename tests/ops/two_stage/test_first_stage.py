@@ -16,7 +16,7 @@ from tests.helpers.scenes import SPEC, make_scene
 from tests.models.two_stage.random_stage import CHANNELS, SETTINGS, RandomStage
 
 
-def test_keypoints_are_points_near_proposals_with_the_map_below_them() -> None:
+def test_keypoints_are_points_near_proposals_and_some_scans_have_none() -> None:
     points, stage = make_scene(0)[0], RandomStage()
     found = run_first_stage(stage, points, SETTINGS)
     assert 0 < len(found.keypoints) <= 64
@@ -25,6 +25,12 @@ def test_keypoints_are_points_near_proposals_with_the_map_below_them() -> None:
     reach = np.hypot(found.proposals.boxes[:, 3], found.proposals.boxes[:, 4]) / 2 + SETTINGS.keypoints.margin_m
     assert (away < reach + 1e-4).any(axis=1).all()
     assert found.bev.shape == (len(found.keypoints), CHANNELS)
+    found = run_first_stage(RandomStage(), np.empty((0, 4), np.float32), SETTINGS)
+    assert found.keypoints.shape == (0, 3)
+    assert found.bev.shape == (0, CHANNELS)
+    settings = FirstStageSettings(ProposalSettings(score_threshold=1.0))
+    found = run_first_stage(RandomStage(), make_scene(0)[0], settings)
+    assert len(found.proposals) == len(found.keypoints) == 0
 
 
 class PlacesStage(RandomStage):
@@ -43,18 +49,6 @@ def test_a_keypoint_reads_the_neck_at_its_own_place() -> None:
     between = ((own > lowest) & (own < highest)).all(axis=1)
     assert between.sum() > 30, "beside the outermost cells the map's border counts"
     np.testing.assert_allclose(found.bev[between], own[between], atol=1e-4)
-
-
-def test_an_empty_scan() -> None:
-    found = run_first_stage(RandomStage(), np.empty((0, 4), np.float32), SETTINGS)
-    assert found.keypoints.shape == (0, 3)
-    assert found.bev.shape == (0, CHANNELS)
-
-
-def test_nothing_proposed() -> None:
-    settings = FirstStageSettings(ProposalSettings(score_threshold=1.0))
-    found = run_first_stage(RandomStage(), make_scene(0)[0], settings)
-    assert len(found.proposals) == len(found.keypoints) == 0
 
 
 @pytest.mark.parametrize(

@@ -73,11 +73,16 @@ def test_residuals_by_hand() -> None:
     assert encode_refinement(box, proposal)[0] == pytest.approx(expected, abs=1e-6)
 
 
-def test_no_boxes() -> None:
+def test_nothing_to_refine_or_to_find() -> None:
     none = np.empty((0, 7), np.float32)
     assert encode_refinement(none, none).shape == decode_refinement(none, none).shape == (0, 7)
     assert roi_grid_points(none, 6).shape == (0, 216, 3)
     assert math.prod(to_box_frames(np.empty((0, 4, 3)), none).shape) == 0
+    found = match_proposals(proposals((0, 0), (1, 1)), np.empty((0, 7), np.float32), np.empty(0, np.int64))
+    assert found.iou.tolist() == [0, 0]
+    targets = roi_targets(proposals((0, 0), (1, 1)), np.empty((0, 7), np.float32), found, np.array([0, 1, 1]))
+    assert targets.confidence.tolist() == [0, 0, 0]
+    assert not targets.positive.any()
 
 
 def proposals(*rows: tuple[float, int]) -> Detections:
@@ -95,26 +100,15 @@ def overlaps(seed: int, count: int, kinds: int) -> Overlaps:
     return Overlaps(iou, np.zeros(count, np.int64), rng.random(count) < 0.2)
 
 
-def test_matching_is_by_class() -> None:
+def test_matching_is_by_class_and_minds_ignored_boxes() -> None:
     # Moved by d m, 4 m long boxes share (4 - d) / (4 + d).
     found = match_proposals(proposals((1, 0), (1, 1), (3, 0), (40, 0)), CAR[None], np.array([0]))
     assert found.iou == pytest.approx([3 / 5, 0, 1 / 7, 0])
     assert found.matched.tolist() == [0, -1, 0, -1]
     assert not found.ignored.any()
-
-
-def test_what_overlaps_an_ignored_box_is_neither_right_nor_wrong() -> None:
     boxes = np.stack([CAR, CAR + np.array([6, 0, 0, 0, 0, 0, 0], np.float32)])
     found = match_proposals(proposals((0, 0), (6, 0), (5, 1), (20, 0)), boxes, np.array([0, IGNORED]))
     assert found.ignored.tolist() == [False, True, True, False]
-
-
-def test_no_objects() -> None:
-    found = match_proposals(proposals((0, 0), (1, 1)), np.empty((0, 7), np.float32), np.empty(0, np.int64))
-    assert found.iou.tolist() == [0, 0]
-    targets = roi_targets(proposals((0, 0), (1, 1)), np.empty((0, 7), np.float32), found, np.array([0, 1, 1]))
-    assert targets.confidence.tolist() == [0, 0, 0]
-    assert not targets.positive.any()
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(1, 200), st.integers(0, 7), st.integers(1, 128))

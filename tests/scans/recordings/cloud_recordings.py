@@ -63,15 +63,9 @@ def laid_out(
     layout = layout or [("x", "f4", 0), ("y", "f4", 4), ("z", "f4", 8), ("intensity", "f4", 12)]
     order = ">" if big_endian else "<"
     types = ("i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8")
-    structure = np.dtype(
-        {
-            "names": [name for name, _, _ in layout],
-            "formats": [order + kind for _, kind, _ in layout],
-            "offsets": [offset for _, _, offset in layout],
-            "itemsize": step,
-        }
-    )
-    packed = np.zeros(len(points), structure)
+    names, kinds, offsets = (list(part) for part in zip(*layout, strict=True))
+    formats = [order + kind for kind in kinds]
+    packed = np.zeros(len(points), {"names": names, "formats": formats, "offsets": offsets, "itemsize": step})
     for index, (name, _, _) in enumerate(layout):
         packed[name] = points[:, index]
     width = len(points) // rows
@@ -80,9 +74,7 @@ def laid_out(
     one = store()
     message = point_cloud2(one, time_ns, points)
     field = one.types["sensor_msgs/msg/PointField"]
-    message.fields = [
-        field(name=name, offset=offset, datatype=types.index(kind) + 1, count=1) for name, kind, offset in layout
-    ]
+    message.fields = [field(name=n, offset=o, datatype=types.index(kind) + 1, count=1) for n, kind, o in layout]
     message.height, message.width, message.point_step = rows, width, step
     message.row_step, message.is_bigendian, message.data = table.shape[1], big_endian, table.reshape(-1)
     return message
@@ -196,6 +188,5 @@ def compressed_image(time_ns: int, content: bytes, format_: str = "jpeg") -> byt
 def clouds(count: int, points: int = 50) -> list[tuple[int, Any]]:
     """(time, message) of as many scans."""
     one = store()
-    return [
-        (time_ns, point_cloud2(one, time_ns, cloud_points(seed, points))) for seed, time_ns in enumerate(stamps(count))
-    ]
+    times = enumerate(stamps(count))
+    return [(time_ns, point_cloud2(one, time_ns, cloud_points(seed, points))) for seed, time_ns in times]

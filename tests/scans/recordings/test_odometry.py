@@ -41,13 +41,14 @@ def test_poses_lie_between_their_neighbors_and_stop_at_the_ends(
     assert matrix[:3, :3] @ matrix[:3, :3].T == pytest.approx(np.eye(3))
 
 
-def test_a_car_that_leans_is_turned_about_every_axis(tmp_path: Path) -> None:
+def test_a_car_that_leans_is_turned_about_every_axis_and_one_pose_is_enough(tmp_path: Path) -> None:
     turns = [(0.3, -0.2, 2.0), (-0.1, 0.4, 2.5)]
     poses = poses_of(tmp_path, [posed(i, 0.0, *turn) for i, turn in enumerate(turns)])
     between = Slerp([0, 1], Rotation.from_euler("xyz", turns))
     for share in (0.0, 0.5, 1.0):  # where a straight line between two quaternions is as far along as the arc
         found = poses.at(START_NS + round(share * SECOND))[:3, :3]
         np.testing.assert_allclose(found, between(share).as_matrix(), atol=1e-9)
+    assert poses_of(tmp_path, [posed(0, 4.0)]).at(START_NS + 7)[0, 3] == 4.0
 
 
 def test_a_quaternion_and_its_opposite_are_the_same_turn(tmp_path: Path) -> None:
@@ -61,10 +62,6 @@ def test_a_quaternion_and_its_opposite_are_the_same_turn(tmp_path: Path) -> None
     for i, yaw in enumerate((0.2, 0.4, 0.6)):
         matrix = poses.at(START_NS + i * SECOND + SECOND // 2)
         assert matrix[:2, 0] == pytest.approx([np.cos(yaw), np.sin(yaw)], abs=1e-6)
-
-
-def test_one_pose_is_enough(tmp_path: Path) -> None:
-    assert poses_of(tmp_path, [posed(0, 4.0)]).at(START_NS + 7)[0, 3] == 4.0
 
 
 def test_what_cannot_be_used_is_named(tmp_path: Path) -> None:

@@ -86,14 +86,11 @@ def foxglove_json(**changes: Any) -> bytes:
     return json.dumps(content | changes).encode()
 
 
-def test_foxglove_in_json() -> None:
+def test_foxglove_in_json_and_in_protobuf_with_a_pose() -> None:
     cloud = read(foxglove_json(), "Foxglove", "json")
     assert np.array_equal(cloud.points.xyz, POINTS[:, :3]) and cloud.time_ns == START_NS + 5
     assert cloud.points.reflectance is not None and np.array_equal(cloud.points.reflectance, POINTS[:, 3])
     assert cloud.frame_id == "lidar"
-
-
-def test_foxglove_in_protobuf_with_a_pose() -> None:
     cloud = read(PROTOBUF, "Foxglove", "protobuf")
     assert cloud.points.xyz == pytest.approx(np.array([[0, -2, 3], [-3, -5, 6]]))
     assert cloud.points.reflectance is not None and cloud.points.reflectance.tolist() == [0.5, 0.25]
@@ -112,10 +109,14 @@ def test_what_breaks_off_is_refused(cut: int) -> None:
             read(data[:-cut], kind, encoding)  # type: ignore[arg-type]
 
 
-def test_a_claim_of_many_points_takes_no_memory() -> None:
+def test_types_that_are_read_and_a_claim_of_many_points() -> None:
     seven = (7).to_bytes(4, "little")  # the number of points, stated twice
     with pytest.raises(ScanError, match="need more"):
         read(livox(False, 7, "lidar").replace(seven, b"\xff\xff\xff\x7f"), "Livox")
+    assert kind_of_scans("livox_ros_driver/CustomMsg") == kind_of_scans(LIVOX) == "Livox"
+    assert kind_of_scans("foxglove.PointCloud") == "Foxglove"
+    assert kind_of_scans("sensor_msgs/PointCloud") == "PointCloud"
+    assert kind_of_scans("sensor_msgs/msg/LaserScan") is None
 
 
 @pytest.mark.parametrize(
@@ -125,10 +126,3 @@ def test_a_claim_of_many_points_takes_no_memory() -> None:
 def test_json_that_contradicts_itself(wrong: dict[str, Any], message: str) -> None:
     with pytest.raises(ScanError, match=message):
         read(foxglove_json(**wrong), "Foxglove", "json")
-
-
-def test_types_that_are_read() -> None:
-    assert kind_of_scans("livox_ros_driver/CustomMsg") == kind_of_scans(LIVOX) == "Livox"
-    assert kind_of_scans("foxglove.PointCloud") == "Foxglove"
-    assert kind_of_scans("sensor_msgs/PointCloud") == "PointCloud"
-    assert kind_of_scans("sensor_msgs/msg/LaserScan") is None

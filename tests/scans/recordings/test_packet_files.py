@@ -63,7 +63,7 @@ def scans_of(path: Path) -> list[RecordedScan]:
     return list(RecordedScans(recording, recording.point_cloud_topic(), "auto").read())
 
 
-def test_a_velodyne_is_cut_by_revolution(tmp_path: Path) -> None:
+def test_velodynes_are_cut_by_revolution_and_ousters_need_metadata(tmp_path: Path) -> None:
     path = capture(tmp_path / "drive.pcap", [b"other", *vlp16_packets(3, 10.0, 51)])
     assert is_recording(path)
     scans = scans_of(path)
@@ -78,6 +78,15 @@ def test_a_velodyne_is_cut_by_revolution(tmp_path: Path) -> None:
     assert reflectance == pytest.approx(0.2)
     directions = np.histogram(np.arctan2(y, x), bins=12)[0]
     assert directions.min() > 0.8 * directions.mean()
+    path = capture(tmp_path / "drive.pcap", vlp16_packets(3, 10.0, 51))
+    complete = scans_of(path)
+    path.write_bytes(path.read_bytes()[: -path.stat().st_size // 3])
+    torn = scans_of(path)
+    assert 2 <= len(torn) < len(complete)
+    first, same = torn[0].scan, complete[0].scan
+    assert first is not None and same is not None and np.array_equal(first.points, same.points)
+    with pytest.raises(ScanError, match=r"drive\.json"):
+        open_recording(capture(tmp_path / "drive.pcap", [b"12345"]))
 
 
 @pytest.mark.parametrize("encoding", ["cdr", "ros1"])
@@ -110,26 +119,11 @@ def test_packets_of_a_velodyne_in_a_recording(encoding: Encoding) -> None:
     assert len(read_point_cloud(Message(1, data, encoding), "a", kind).points.xyz) == 0
 
 
-def test_what_lies_before_a_tear_is_read(tmp_path: Path) -> None:
-    path = capture(tmp_path / "drive.pcap", vlp16_packets(3, 10.0, 51))
-    whole = scans_of(path)
-    path.write_bytes(path.read_bytes()[: -path.stat().st_size // 3])
-    torn = scans_of(path)
-    assert 2 <= len(torn) < len(whole)
-    first, same = torn[0].scan, whole[0].scan
-    assert first is not None and same is not None and np.array_equal(first.points, same.points)
-
-
 @pytest.mark.parametrize("content", [b"no capture", b""])
 def test_no_capture(tmp_path: Path, content: bytes) -> None:
     (tmp_path / "drive.pcap").write_bytes(content)
     with pytest.raises(ScanError, match=r"drive\.pcap"):
         open_recording(tmp_path / "drive.pcap")
-
-
-def test_packets_of_an_ouster_need_its_metadata(tmp_path: Path) -> None:
-    with pytest.raises(ScanError, match=r"drive\.json"):
-        open_recording(capture(tmp_path / "drive.pcap", [b"12345"]))
 
 
 @pytest.mark.skipif(not CAPTURES_THERE, reason="needs real captures: ASCA_OUSTER_CAPTURES")

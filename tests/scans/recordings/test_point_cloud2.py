@@ -15,14 +15,8 @@ from benchmarks.made_recordings import point_cloud2
 from tests.scans.recordings.cloud_recordings import CLOUD, START_NS, cloud_points, laid_out, serialized, store
 
 POINTS = cloud_points(1, 24)
-OUSTER = [
-    ("x", "f4", 0),
-    ("y", "f4", 4),
-    ("z", "f4", 8),
-    ("reflectivity", "u2", 20),
-    ("ring", "u1", 24),
-    ("t", "u4", 16),
-]
+XYZ = [("x", "f4", 0), ("y", "f4", 4), ("z", "f4", 8)]
+OUSTER = [*XYZ, ("reflectivity", "u2", 20), ("ring", "u1", 24), ("t", "u4", 16)]
 
 
 def read(message: Any, recorded_ns: int | None = 5, *, ros1: bool = False) -> PointCloud:
@@ -43,16 +37,13 @@ def test_offsets_padding_and_byte_order(big_endian: bool, rows: int, row_padding
     assert cloud.points.reflectance is not None and np.array_equal(cloud.points.reflectance, POINTS[:, 3])
 
 
-def test_whole_numbers_as_drivers_write_them() -> None:
+def test_whole_numbers_clouds_without_a_reflectance_and_without_points() -> None:
     columns = np.column_stack([POINTS[:, :3], np.arange(24) * 100, np.arange(24), np.arange(24)])
     cloud = read(laid_out(columns.astype(np.float32), layout=OUSTER, step=32))
     assert cloud.points.reflectance is not None and cloud.points.dtype is not None
     assert cloud.points.reflectance.tolist() == [100 * i for i in range(24)]
     assert cloud.points.dtype.kind == "u" and np.array_equal(cloud.points.xyz, POINTS[:, :3])
-
-
-def test_without_a_reflectance_and_without_points() -> None:
-    cloud = read(laid_out(POINTS, layout=[("x", "f4", 0), ("y", "f4", 4), ("z", "f4", 8)], step=12))
+    cloud = read(laid_out(POINTS, layout=XYZ, step=12))
     assert cloud.points.reflectance is None
     assert len(read(laid_out(POINTS[:0])).points.xyz) == 0
 

@@ -92,7 +92,7 @@ def test_the_reference_is_kitti_s() -> None:
     assert len(kitti_reference().sensor.elevation_deg) == len(real.scan.points_per_ring or ()) == 64
 
 
-def test_the_report_holds_every_row_and_the_pictures(measured: Measured, tmp_path: Path) -> None:
+def test_the_report_the_pictures_and_the_console_tell_every_row(measured: Measured, tmp_path: Path) -> None:
     reference = kitti_reference()
     comparison = compare(measured, reference.statistics)
     plots = write_plots(tmp_path, comparison, measured, reference.sensor)
@@ -106,9 +106,6 @@ def test_the_report_holds_every_row_and_the_pictures(measured: Measured, tmp_pat
     for name in plots:
         picture = cv2.imread(str(tmp_path / name))
         assert picture is not None and picture.std() > 20, "lines on white"
-
-
-def test_the_console_names_what_misses_its_bar(measured: Measured) -> None:
     comparison = compare(measured, kitti_reference().statistics)
     console = Console(record=True, width=80, file=io.StringIO())
     print_comparison(comparison, console)

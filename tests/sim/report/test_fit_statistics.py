@@ -35,14 +35,11 @@ def test_windows_are_measured_against_the_doors_below_them(share: float) -> None
     assert found == pytest.approx(share, rel=0.1)
 
 
-def test_windows_of_cars_seen_end_on_or_far_away_are_not_measured() -> None:
+def test_what_cannot_be_measured_is_left_out() -> None:
     for box in ([12.0, 0.0, -0.9, 4.0, 1.7, 1.5, 0.05], [30.0, 4.0, -0.9, 4.0, 1.7, 1.5, 0.9]):
         assert np.isnan(window_returns(flank(box, 1.0), np.array(box)))
     box = [12.0, 4.0, -0.9, 4.0, 1.7, 1.5, 0.9]
     assert np.isnan(window_returns(flank(box, 1.0)[::2000], np.array(box))), "too few points to tell"
-
-
-def test_hidden_and_cut_objects_are_left_out() -> None:
     boxes = np.array([[10.0, 3.0, -0.8, 0.8, 0.6, 1.7, 0.0]] * 3)
     objects = objects_from_boxes(boxes, ["Pedestrian", "Pedestrian", "Cyclist"], CALIBRATION)
     rng = np.random.default_rng(0)

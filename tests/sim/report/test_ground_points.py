@@ -17,7 +17,7 @@ def test_the_ground_of_a_made_up_scan_is_found(slope: float) -> None:
     np.testing.assert_allclose(plane, [slope, 0, GROUND_Z_M], atol=1e-3)
 
 
-def test_a_hill_is_followed_and_a_roof_is_not() -> None:
+def test_a_hill_is_followed_and_neither_a_roof_nor_a_wall_is_ground() -> None:
     rng = np.random.default_rng(0)
     radius, angle = 70 * np.sqrt(rng.random(60_000)), rng.uniform(-np.pi, np.pi, 60_000)
     z = GROUND_Z_M + 0.06 * np.maximum(radius - 20, 0)  # three metres up at 70 m
@@ -26,9 +26,6 @@ def test_a_hill_is_followed_and_a_roof_is_not() -> None:
     found = ground_mask(points)
     assert found[~on_roof].mean() > 0.95
     assert not found[on_roof].any()
-
-
-def test_where_no_ground_is_to_be_seen_there_is_none() -> None:
     rng = np.random.default_rng(0)
     assert ground_mask(np.zeros((0, 4), np.float32)).shape == (0,)
     assert not ground_mask(rng.random((50, 4))).any()

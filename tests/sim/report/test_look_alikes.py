@@ -21,23 +21,9 @@ def objects(name: str, count: int, seed: int, *, more: float = 1.0, score: float
     for _ in range(count):
         distance, view, occluded = rng.uniform(8, 50), rng.uniform(0, 90), int(rng.integers(0, 3))
         points = more * 60_000 * distance**-2 * (1 + np.sin(np.deg2rad(view))) / (1 + occluded) * rng.uniform(0.8, 1.25)
-        shares = rng.uniform(0.05, 0.15, 4)
-        made.append(
-            ObjectRecord(
-                class_name=name,
-                distance_m=distance,
-                view_deg=view,
-                occluded=occluded,
-                points=points,
-                lowest=shares[0],
-                wheels=shares[1],
-                middle=shares[2],
-                length_m=2.0,
-                bright=shares[3],
-                pillars=points / 3,
-                score=rng.uniform(0.2, 0.8) + score,
-            )
-        )
+        lowest, wheels, middle, bright = rng.uniform(0.05, 0.15, 4)
+        parts = (lowest, wheels, middle, 2.0, bright, points / 3, rng.uniform(0.2, 0.8) + score)
+        made.append(ObjectRecord(name, distance, view, occluded, points, *parts))
     return made
 
 
@@ -46,7 +32,7 @@ def row(rows: list[LikeRow], name: str, measure: str) -> LikeRow:
     return found
 
 
-def test_without_a_gap_ratios_are_1_and_percentiles_one_half() -> None:
+def test_gaps_are_measured_and_found_nowhere_else() -> None:
     rows = compare_objects(objects("Car", 60, 1), objects("Car", 3000, 2))
     for measure in ("points", "pillars", "lowest", "wheels", "middle", "bright", "score"):
         found = row(rows, "Car", measure)
@@ -55,9 +41,6 @@ def test_without_a_gap_ratios_are_1_and_percentiles_one_half() -> None:
         assert abs(found.percentile - 0.5) < 3 * found.percentile_error
         assert found.ratio_interval[0] < 1.0 < found.ratio_interval[1]
     assert row(rows, "Car", "length_m").percentile == 0.5  # ties count half
-
-
-def test_a_gap_is_found_and_measured() -> None:
     real = objects("Cyclist", 40, 3, more=1.6, score=-0.3)
     rows = compare_objects(real, objects("Cyclist", 3000, 4))
     points = row(rows, "Cyclist", "points")
@@ -67,7 +50,7 @@ def test_a_gap_is_found_and_measured() -> None:
     assert row(rows, "Cyclist", "score").percentile < 0.25
 
 
-def test_look_alikes_are_alike() -> None:
+def test_look_alikes_are_alike_and_classes_with_few_objects_left_out() -> None:
     real, simulated = objects("Car", 20, 5), objects("Car", 4000, 6)
     for like_points in (False, True):
         for index, chosen in enumerate(look_alikes(real, simulated, like_points=like_points)):
@@ -76,9 +59,8 @@ def test_look_alikes_are_alike() -> None:
                 assert other.occluded == real[index].occluded
                 assert abs(np.log(other.distance_m / real[index].distance_m)) < 0.25
                 assert abs(other.view_deg - real[index].view_deg) < 25
-
-
-def test_classes_without_enough_objects_are_left_out_and_scores_are_joined() -> None:
+    among = np.array([[1.0, 2.0, 2.0, 3.0], [1.0, 2.0, 3.0, 4.0]])
+    np.testing.assert_allclose(percentiles(np.array([2.0, 9.0]), among), [0.5, 1.0])
     real = objects("Car", 5, 1) + objects("Pedestrian", 4, 2) + objects("Cyclist", 3, 3)
     simulated = objects("Car", 200, 4) + objects("Pedestrian", 200, 5) + objects("Cyclist", NEIGHBORS - 1, 6)
     rows = compare_objects(real, simulated)
@@ -86,8 +68,3 @@ def test_classes_without_enough_objects_are_left_out_and_scores_are_joined() -> 
     assert row(rows, ALL, "score").objects == 9
     unscored = [record._replace(score=float("nan")) for record in simulated]
     assert not [found for found in compare_objects(real, unscored) if found.measure == "score"]
-
-
-def test_percentiles_by_hand() -> None:
-    among = np.array([[1.0, 2.0, 2.0, 3.0], [1.0, 2.0, 3.0, 4.0]])
-    np.testing.assert_allclose(percentiles(np.array([2.0, 9.0]), among), [0.5, 1.0])

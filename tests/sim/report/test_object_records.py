@@ -16,7 +16,7 @@ def labels(boxes: np.ndarray, names: tuple[str, ...]) -> list[KittiObject]:
     return objects_from_boxes(boxes, names, CALIBRATION)
 
 
-def test_shares_by_height_length_and_brightness() -> None:
+def test_shares_and_scores_of_objects() -> None:
     # The box stands across: its length is along y, from -2 to 2; its bottom is at -2.
     points = np.array(
         [
@@ -34,9 +34,6 @@ def test_shares_by_height_length_and_brightness() -> None:
     assert (record.lowest, record.wheels, record.middle) == (0.25, 0.5, 0.25)
     assert record.length_m == pytest.approx(3.0) and record.bright == 0.5
     assert np.isnan(record.score)
-
-
-def test_the_score_is_that_of_the_best_detection_of_its_class_there() -> None:
     points = np.array([[20.0, 0.0, -1.0, 0.1]], np.float32)
     aside = BOX + np.array([0, 9, 0, 0, 0, 0, 0], np.float32)
     found = Detections(

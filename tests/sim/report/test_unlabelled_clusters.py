@@ -41,9 +41,15 @@ def kinds(scan: np.ndarray, found: Detections, labelled: np.ndarray = NONE, igno
     return {row.kind: (row.clusters, row.share) for row in rows}
 
 
-def test_clusters_are_told_by_their_size_and_brightness(scan: np.ndarray) -> None:
+def test_clusters_are_connected_cells_told_by_size_and_brightness(scan: np.ndarray) -> None:
     found = kinds(scan, Detections.empty(NAMES))
     assert found["person"] == (1, 0.0) and found["tall"] == (1, 0.0) and found["bright"] == (1, 0.0)
+    label = np.array([[15, -5, -0.9, 0.8, 0.8, 1.7, 0]], np.float32)
+    assert kinds(scan, Detections.empty(NAMES), label)["person"][0] == 0
+    assert kinds(scan, Detections.empty(NAMES), ignored=scan[:, 1] < 0)["person"][0] == 0
+    xy = np.array([[0.1, 0.1], [0.3, 0.3], [0.6, 0.3], [2.0, 2.0], [2.1, 2.2]], np.float32)
+    groups = connected(xy)
+    assert groups[0] == groups[1] == groups[2] != groups[3] == groups[4]
 
 
 @pytest.mark.parametrize(
@@ -55,15 +61,3 @@ def test_a_person_or_cyclist_of_enough_score_near_its_middle_fires(
 ) -> None:
     assert kinds(scan, detections(x, -5.0, score, label))["person"] == (1, share)
     assert kinds(scan, detections(x, -5.0, score, 0))["person"] == (1, 0.0), "cars are another matter"
-
-
-def test_what_is_labelled_or_in_a_dont_care_area_does_not_count(scan: np.ndarray) -> None:
-    label = np.array([[15, -5, -0.9, 0.8, 0.8, 1.7, 0]], np.float32)
-    assert kinds(scan, Detections.empty(NAMES), label)["person"][0] == 0
-    assert kinds(scan, Detections.empty(NAMES), ignored=scan[:, 1] < 0)["person"][0] == 0
-
-
-def test_points_are_connected_through_touching_cells() -> None:
-    xy = np.array([[0.1, 0.1], [0.3, 0.3], [0.6, 0.3], [2.0, 2.0], [2.1, 2.2]], np.float32)
-    groups = connected(xy)
-    assert groups[0] == groups[1] == groups[2] != groups[3] == groups[4]

@@ -94,7 +94,7 @@ def test_two_stacked_sensors_are_one_list_of_lasers() -> None:
     assert (measured[upper].max(), measured[upper].min()) == pytest.approx((15.0, -25.0), abs=0.1)
 
 
-def test_a_laser_above_another_takes_its_origin_along() -> None:
+def test_lasers_take_their_origin_along_and_kitti_s_sensor_has_its_pattern() -> None:
     """Two lasers have almost the same elevation, and in some scans the lower one is adjusted above the other."""
     lidar = Lidar(
         elevation_deg=(0.01, 0.0), origin_z_m=((0.0, 0.0), (-1.0, -1.0)), elevation_jitter_deg=1.0, ring_gain=()
@@ -102,9 +102,6 @@ def test_a_laser_above_another_takes_its_origin_along() -> None:
     drawn = [draw_firings(lidar, np.random.default_rng(seed), camera_only=True) for seed in range(20)]
     assert all((np.diff(firings.slope) < 0).all() for firings in drawn)
     assert {tuple(firings.origin_z_m) for firings in drawn} == {(0.0, -1.0), (-1.0, 0.0)}
-
-
-def test_the_sensor_of_kitti_has_its_pattern_and_its_car() -> None:
     firings = draw_firings(Lidar(), np.random.default_rng(1), camera_only=False)
     step = np.rad2deg(np.diff(firings.azimuth_rad))
     assert np.isclose(step, 0.09).mean() == pytest.approx(0.1428, abs=0.002)

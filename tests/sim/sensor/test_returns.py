@@ -47,15 +47,12 @@ def slant(returns: Returns, firings: Firings) -> np.ndarray:
     return np.sqrt(x**2 + y**2 + (z - firings.origin_z_m[returns.ring]) ** 2)
 
 
-def test_without_noise_a_scan_is_exact_up_to_its_rounding() -> None:
+def test_scans_are_exact_without_noise_and_noisy_within_and_across_rings() -> None:
     returns, firings = scan(QUIET, 10.0)
     assert len(returns.points) == firings.hidden.size
     expected = 10.0 * np.sqrt(1 + firings.slope[returns.ring] ** 2)
     np.testing.assert_allclose(slant(returns, firings), expected, atol=0.001)
     np.testing.assert_allclose(returns.points[:, 3], 0.40)
-
-
-def test_noise_within_and_across_rings() -> None:
     lidar = replace(QUIET, range_sigma_m=(0.008, 0.008), ring_bias_sigma_m=0.016)
     returns, firings = scan(lidar, 10.0)
     error = slant(returns, firings) - 10.0 * np.sqrt(1 + firings.slope[returns.ring] ** 2)
@@ -77,15 +74,12 @@ def test_reflectance_fades_with_range_and_weak_returns_become_zero_before_they_a
     assert kept == sorted(kept, reverse=True) and kept[1] == 1.0
 
 
-def test_faint_reflectances_are_zero_and_bright_ones_never() -> None:
+def test_faint_reflectances_are_zero_and_gains_are_those_of_the_ring() -> None:
     lidar = replace(QUIET, faint_reflectance=(0.2, 0.2))
     share = {value: (scan(lidar, 10.0, value)[0].points[:, 3] == 0).mean() for value in (0.05, 0.1, 0.25)}
     assert share[0.05] == pytest.approx(0.75, abs=0.02)
     assert share[0.1] == pytest.approx(0.5, abs=0.02)
     assert share[0.25] == 0
-
-
-def test_a_laser_s_gain_is_that_of_its_ring_in_every_scan() -> None:
     gain = np.linspace(0.5, 1.5, 64)
     for seed in (0, 1):
         returns, _ = scan(replace(QUIET, ring_gain=tuple(gain)), 10.0, seed=seed)

@@ -19,7 +19,7 @@ def scene(seed: int) -> MovingScene:
     return draw_moving_scene(SceneConfig(), np.random.default_rng([seed, 0]), np.random.default_rng([seed, 1]), 10.0)
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(2))
 def test_ground_and_markings_stay_in_the_world(seed: int) -> None:
     world, moment = scene(seed), scene(seed).at(9.0)
     driven, _, lifted = moment.ego_pose[:3, 3]
@@ -35,7 +35,7 @@ def test_ground_and_markings_stay_in_the_world(seed: int) -> None:
     assert under == pytest.approx(world.scene.ground.heights((0.0, 0.0))[0]), "the sensor is as high as before"
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_rays_meet_the_ground_that_has_moved(seed: int) -> None:
     """Hills shifted by whole steps of their lattice are another lattice, whose rays need no shift."""
     steep = SceneConfig(bend_sigma_per_m=0.0, heading_error_sigma_rad=0.0, turning_share=0.0, relief_m=(2.0, 4.0))
@@ -49,14 +49,9 @@ def test_rays_meet_the_ground_that_has_moved(seed: int) -> None:
     firings = draw_firings(Lidar(), np.random.default_rng(1), camera_only=False)
     nothing = Primitives.join([])
     none = np.zeros(0, np.int64)
-    hits = [
-        cast(Bodies(nothing, none, none, none, none), 0, one, firings, 5)
-        for one in (
-            replace(there, z_m=z_m),
-            replace(ground, street=street._replace(along_m=driven), z_m=z_m),
-        )
-    ]
-    first, second = (one.rho_m for one in hits)
+    shifted = replace(ground, street=street._replace(along_m=driven), z_m=z_m)
+    grounds = replace(there, z_m=z_m), shifted
+    first, second = (cast(Bodies(nothing, none, none, none, none), 0, one, firings, 5).rho_m for one in grounds)
     near = first < 60  # beyond, the rolled lattice is at its end
     assert near.mean() > 0.3
     assert np.quantile(np.abs(first[near] - second[near]), 0.999) < 0.01

@@ -23,19 +23,16 @@ def scene(seed: int, duration_s: float = 8.0):
     return draw_moving_scene(SceneConfig(cars=14, pedestrians=8, cyclists=6), rng, ways, duration_s)
 
 
-def test_a_way_stops_at_its_ends() -> None:
+def test_ways_stop_at_their_ends_and_traffic_comes_back_as_somebody_else() -> None:
     places = Trajectory(1.0, 2.0, np.pi / 2, 2.0, -1.0, 3.0).at(np.array([-2.0, -0.5, 0.0, 1.0, 5.0]))
     assert places.xy_m[:, 1] == pytest.approx([1.0, 1.0, 2.0, 4.0, 5.0])
     assert places.speed_mps.tolist() == [0.0, 2.0, 2.0, 2.0, 0.0]
-
-
-def test_traffic_comes_back_as_somebody_else() -> None:
     places = Trajectory(100.0, 2.0, 0.0, 10.0, ring=True).at(np.array([0.0, 1.0, 2.0, 30.0]))
     assert places.xy_m[:, 0] == pytest.approx([100.0, 110.0, 120.0 - RING_M, 400.0 - 2 * RING_M])
     assert places.laps.tolist() == [0, 0, 1, 2]
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(3))
 def test_nobody_touches_the_car_or_anybody_else(seed: int) -> None:
     world = scene(seed)
     assert world.ego.speed_mps * world.duration_s <= TRAVEL_M + 1e-9
@@ -50,11 +47,11 @@ def test_nobody_touches_the_car_or_anybody_else(seed: int) -> None:
             assert tree.query(shape, "intersects").tolist() == [index]
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_objects_go_where_their_velocity_says_and_keep_their_size(seed: int) -> None:
     world, step = scene(seed), 0.1
     seen = moved = 0
-    for time_s in np.arange(0.0, world.duration_s - step, 0.9):
+    for time_s in np.arange(0.0, world.duration_s - step, 1.3):
         before, after = world.at(time_s), world.at(time_s + step)
         later = dict(zip(after.track_ids, after.scene.targets, strict=True))
         for row, (number, target) in enumerate(zip(before.track_ids, before.scene.targets, strict=True)):

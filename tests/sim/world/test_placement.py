@@ -23,18 +23,21 @@ def targets(config: SceneConfig, scenes: int) -> list[list[Target]]:
     return found
 
 
-def test_a_footprint_is_taken_once() -> None:
+def test_footprints_are_taken_once_and_two_seaters_are_rare() -> None:
     occupied = Occupied()
     assert occupied.take(0.0, 0.0, 4.0, 2.0, 0.3)
     assert not occupied.take(1.0, 0.5, 1.0, 1.0, 0.0)
     assert occupied.take(0.0, 2.2, 4.0, 2.0, 0.3)  # beside it, parallel
     assert not occupied.take(0.0, -2.2, 4.0, 2.0, 0.3, margin_m=0.5)
+    lengths = np.array([draw_size(np.random.default_rng(seed), "Car")[0] for seed in range(2000)])
+    assert 0.005 < (lengths < 2.9).mean() < 0.05
+    assert lengths.min() < 2.6
 
 
 def test_objects_stay_near_the_level_of_their_street() -> None:
     config = SceneConfig(relief_m=(2.5, 3.0))
     near, per_m = config.level_band_m
-    for index in range(20):
+    for index in range(8):
         scene = draw_scene(config, np.random.default_rng(index))
         for target in scene.targets:
             x, y, z, _, _, height, _ = target.box
@@ -118,9 +121,3 @@ def test_streets_are_as_full_behind_and_beside_the_car_as_ahead() -> None:
         assert (boxes[:, 0] > 0).mean() == pytest.approx(0.5, abs=0.08)
         assert (boxes[:, 1] > 0).mean() == pytest.approx(0.5, abs=0.17)  # the car keeps to the right of its street
         assert (np.abs(boxes[:, 0]) < np.abs(boxes[:, 1])).mean() > 0.05
-
-
-def test_two_seaters_are_rare_but_there() -> None:
-    lengths = np.array([draw_size(np.random.default_rng(seed), "Car")[0] for seed in range(2000)])
-    assert 0.005 < (lengths < 2.9).mean() < 0.05
-    assert lengths.min() < 2.6

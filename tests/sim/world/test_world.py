@@ -38,13 +38,8 @@ def scan(primitives: Primitives, ground: Ground | None = None) -> tuple[Hits, np
     """Hits of a whole revolution, and the points of all that was met (N,3)."""
     firings = draw_firings(Lidar(elevation_jitter_deg=0.0), np.random.default_rng(1), camera_only=False)
     triangles, ellipsoids = len(primitives.triangles), len(primitives.centers)
-    bodies = Bodies(
-        primitives,
-        np.full(triangles, BACKGROUND),
-        np.arange(triangles),
-        np.full(ellipsoids, BACKGROUND),
-        triangles + np.arange(ellipsoids),
-    )
+    owners = np.full(triangles, BACKGROUND), np.full(ellipsoids, BACKGROUND)
+    bodies = Bodies(primitives, owners[0], np.arange(triangles), owners[1], triangles + np.arange(ellipsoids))
     hits = cast(bodies, 0, ground, firings, 5)
     ring, column = np.nonzero(hits.owner == BACKGROUND)
     rho, azimuth = hits.rho_m[ring, column], firings.azimuth_rad[column] + firings.phase_rad[ring]
@@ -52,17 +47,9 @@ def scan(primitives: Primitives, ground: Ground | None = None) -> tuple[Hits, np
     return hits, np.stack([rho * np.cos(azimuth), rho * np.sin(azimuth), z], axis=-1)
 
 
-def test_same_seed_same_world() -> None:
-    one, two = (draw_scene(SceneConfig(), np.random.default_rng([4, 2])).background for _ in range(2))
-    np.testing.assert_array_equal(one.triangles, two.triangles)
-    np.testing.assert_array_equal(one.unit_from_world, two.unit_from_world)
-    other = draw_scene(SceneConfig(), np.random.default_rng([4, 3])).background
-    assert one.triangles.shape != other.triangles.shape
-
-
 def test_nothing_of_the_background_stands_in_a_labelled_object() -> None:
     inside = seen = 0
-    for scene in scenes(10):
+    for scene in scenes(5):
         _, points = scan(scene.background)
         assert len(points) > 20_000
         for target in scene.targets:
@@ -75,7 +62,7 @@ def test_nothing_of_the_background_stands_in_a_labelled_object() -> None:
             )
             inside += int((within & (np.abs(dz) < height / 2 - 0.1)).sum())
             seen += 1
-    assert seen > 100
+    assert seen > 50
     assert inside < 0.5 * seen
 
 
@@ -92,9 +79,8 @@ def test_every_kind_of_street_is_lined_and_cluttered(kind: str) -> None:
     assert builder.occupied.count > lined
     assert np.isfinite(primitives.triangles).all()
     assert np.isfinite(primitives.unit_from_world).all()
-    assert (primitives.triangle_surface[:, 0] > 0).all() and (
-        primitives.triangle_surface[:, 0] <= 5
-    ).all()  # foil sends light back to where it came from
+    reflectance = primitives.triangle_surface[:, 0]
+    assert (reflectance > 0).all() and (reflectance <= 5).all()  # foil sends light back to where it came from
     assert set(LININGS) == set(KINDS)
 
 
@@ -103,7 +89,7 @@ def test_every_thing_keeps_out_of_what_is_taken(thing) -> None:  # type: ignore[
     builder = builder_on(flat())
     builder.occupied = Occupied()
     assert builder.occupied.take(0.0, 0.0, 200.0, 200.0, 0.0)
-    for _ in range(8):
+    for _ in range(3):
         thing(builder, 5.0, 6.0)
     assert len(builder.primitives().triangles) == 0
     assert len(builder.primitives().centers) == 0
@@ -114,7 +100,7 @@ def test_every_thing_keeps_out_of_what_is_taken(thing) -> None:  # type: ignore[
     assert low and -2.4 < min(low) < 0.5
 
 
-def test_rays_go_into_a_wood_and_return_from_different_depths() -> None:
+def test_rays_go_into_woods_and_through_shrubs() -> None:
     ground = flat()
     builder = builder_on(ground, seed=2)
     wood(builder, Stretch(-15.0, 30.0, 1.0, 8.0))
@@ -125,9 +111,6 @@ def test_rays_go_into_a_wood_and_return_from_different_depths() -> None:
     assert np.percentile(depth, 95) - np.percentile(depth, 5) > 1.0
     # Neighboring firings meet the same cluster more often than not: leaves are no noise.
     assert np.median(np.abs(np.diff(depth))) < 0.25
-
-
-def test_a_shrub_lets_some_rays_through() -> None:
     through = met = 0
     for seed in range(12):
         ground = flat()
@@ -146,7 +129,7 @@ def test_a_shrub_lets_some_rays_through() -> None:
     assert through > 50
 
 
-def test_the_ground_has_the_statistics_of_real_streets() -> None:
+def test_grounds_have_the_statistics_of_real_streets_and_hills_leave_the_road_level() -> None:
     """KITTI: slope ahead 0.011 +- 0.004, to the left -0.009 +- 0.018, ground 1.73 +- 0.04 m below the sensor."""
     offsets = np.array([(0.0, 0.0), (8.0, 0.0), (-8.0, 0.0)])
     rng = np.random.default_rng(8)
@@ -156,16 +139,13 @@ def test_the_ground_has_the_statistics_of_real_streets() -> None:
     assert slope_x.std() < 0.009
     assert abs(heights[:, 0].mean() + 1.75) < 0.03
     assert np.abs(heights[:, 1:] - heights[:, :1]).max() < 0.6
-
-
-def test_hills_leave_the_road_level_near_the_car() -> None:
     relief = draw_relief(np.random.default_rng(5), (0.0, 0.0), 3.0)
     middle = len(relief) // 2
     near = relief[middle - 2 : middle + 3, middle - 2 : middle + 3]
     assert np.abs(near).max() < 0.25 * max(np.abs(relief).max(), 0.1)
 
 
-def test_tracks_on_a_bed_stand_above_the_road() -> None:
+def test_grounds_roads_and_their_coordinates() -> None:
     ground = flat(rails_v_m=8.0, tracks=2.0, bed_m=0.2, bed_half_m=3.2, rail_m=0.15)
     rails = np.array([8.0 + track + rail for track in (-1.7, 1.7) for rail in (-0.75, 0.75)])
     points = np.stack([np.full(4, 12.0), rails], axis=-1)
@@ -174,18 +154,28 @@ def test_tracks_on_a_bed_stand_above_the_road() -> None:
     assert ground_material(12.0, rails[0], ground.street) == RAIL
     assert ground_material(12.0, 8.0, ground.street) == BALLAST
     assert ground.left_edge_m == pytest.approx(11.2)
-
-
-def test_a_second_carriageway_is_road_and_banks_begin_behind_it() -> None:
     ground = flat(second_v_m=9.0, second_half_m=3.0, bank_left=0.3, kerb_m=0.1)
     assert ground.heights((0.0, 9.0))[0] == pytest.approx(-1.73)
     assert ground.heights((0.0, 16.0))[0] == pytest.approx(-1.73 + 0.1 + 0.3 * 3.0)
-
-
-def test_a_ditch_lies_beyond_the_pavement_and_ends_at_a_crossing() -> None:
     numbers = {"ditch_m": 0.4, "cross_u_m": 40.0, "cross_half_m": 3.0}
     assert flat(**numbers).heights((0.0, 5.0))[0] == pytest.approx(-1.73 - 0.4)
     assert flat(**numbers).heights((35.5, 5.0))[0] == pytest.approx(-1.73)
+    with pytest.raises(TypeError, match="curb_m"):
+        make_street(curb_m=0.1)
+    ground = flat(yaw_rad=0.3, bend_per_m=0.004, offset_m=1.4)
+    rng = np.random.default_rng(0)
+    for u, v in rng.uniform(-60.0, 60.0, (20, 2)):
+        x, y, _ = ground.to_lidar(float(u), float(v))
+        np.testing.assert_allclose(ground.to_road(x, y), (u, v), atol=1e-9)
+    ground = flat(yaw_rad=0.3, bend_per_m=0.004, offset_m=1.4, cross_u_m=12.0, cross_half_m=3.0, cross_tilt_rad=-0.2)
+    rng = np.random.default_rng(1)
+    (along, across), cross = rng.uniform(-60.0, 60.0, (2, 40)), rng.random(40) < 0.5
+    one_by_one = [
+        (ground.cross_to_lidar if beside else ground.to_lidar)(float(u), float(v))
+        for u, v, beside in zip(along, across, cross, strict=True)
+    ]
+    at_once = np.column_stack([ground.places(along, across, cross), ground.headings(along, cross)])
+    np.testing.assert_array_equal(at_once, one_by_one)
 
 
 def test_closed_ends_and_houses_stand_where_they_are_asked_for() -> None:
@@ -201,13 +191,6 @@ def test_closed_ends_and_houses_stand_where_they_are_asked_for() -> None:
         assert points[:, 0].min() > 33.0
 
 
-def test_a_share_of_scenes_is_empty_but_never_bare() -> None:
-    config = SceneConfig(empty_share=1.0)
-    for scene in scenes(3, config):
-        assert not scene.targets
-        assert len(scene.background.triangles) > 2000
-
-
 def test_scans_of_the_world_have_the_shape_of_real_ones() -> None:
     """KITTI: 55 +- 11 % of the points on the ground, 84 % of the firings of the top rings return."""
     on_ground, high = [], []
@@ -219,28 +202,3 @@ def test_scans_of_the_world_have_the_shape_of_real_ones() -> None:
     assert 0.47 < np.mean(on_ground) < 0.67  # a little more than in scans, where weak returns are lost
     assert 0.74 < np.mean(high) < 0.95
     assert np.std(on_ground) > 0.05
-
-
-def test_road_coordinates_and_back() -> None:
-    ground = flat(yaw_rad=0.3, bend_per_m=0.004, offset_m=1.4)
-    rng = np.random.default_rng(0)
-    for u, v in rng.uniform(-60.0, 60.0, (20, 2)):
-        x, y, _ = ground.to_lidar(float(u), float(v))
-        np.testing.assert_allclose(ground.to_road(x, y), (u, v), atol=1e-9)
-
-
-def test_many_places_at_once_are_those_one_by_one() -> None:
-    ground = flat(yaw_rad=0.3, bend_per_m=0.004, offset_m=1.4, cross_u_m=12.0, cross_half_m=3.0, cross_tilt_rad=-0.2)
-    rng = np.random.default_rng(1)
-    (along, across), cross = rng.uniform(-60.0, 60.0, (2, 40)), rng.random(40) < 0.5
-    one_by_one = [
-        (ground.cross_to_lidar if beside else ground.to_lidar)(float(u), float(v))
-        for u, v, beside in zip(along, across, cross, strict=True)
-    ]
-    at_once = np.column_stack([ground.places(along, across, cross), ground.headings(along, cross)])
-    np.testing.assert_array_equal(at_once, one_by_one)
-
-
-def test_a_street_has_no_misspelt_number() -> None:
-    with pytest.raises(TypeError, match="curb_m"):
-        make_street(curb_m=0.1)
