@@ -10,6 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from asca_deploy import shipped
+from asca_pillars.base import installation
 from tests.helpers.blank_plots import blank_plots
 from tests.helpers.documentation import DOCS, Block, blocks, help_of, run, write_files
 
@@ -49,6 +51,9 @@ def test_every_block_runs(name: str, files: Path, tmp_path: Path, monkeypatch: p
         shutil.rmtree(tmp_path / folder)
     monkeypatch.chdir(tmp_path)
     blank_plots(monkeypatch)
+    models = installation.shipped_models()
+    for module in (installation, shipped):  # the smallest model takes the least time
+        monkeypatch.setattr(module, "shipped_models", lambda: models | {"default": models["fast"]})
     logging.getLogger("asca_pillars").setLevel(logging.ERROR)
     for block in runs(name):
         run(block, name)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.helpers.package_imports import PACKAGES, ROOT, imports
+from tests.helpers.package_imports import PACKAGES, ROOT, import_statements, imports
 
 BLOCK = re.search(r"```text\n(.*?)```", (ROOT / "docs" / "ARCHITECTURE.md").read_text(encoding="utf-8"), re.DOTALL)
 assert BLOCK is not None
@@ -18,12 +18,8 @@ NEEDS_TORCH = {"ablation", "asca_export", "cli", "models", "training"}
 
 def modules_read(path: Path, known: set[str]) -> set[str]:
     """Modules of these packages that a file imports, within functions as well, but not for types alone."""
-    tree = ast.parse(path.read_text(encoding="utf-8"))
-    for node in ast.walk(tree):
-        if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING":
-            node.body = []
     found: set[str] = set()
-    for node in ast.walk(tree):
+    for node in (node for node, for_types in import_statements(path) if not for_types):
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):

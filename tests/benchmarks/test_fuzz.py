@@ -10,9 +10,8 @@ from benchmarks import fuzz
 from benchmarks.fuzz_inputs import Kind
 
 
-@pytest.mark.parametrize("seed", [1, 2])
-def test_damaged_input_is_read_or_refused(tmp_path: Path, seed: int) -> None:
-    counts, failures = fuzz.fuzz(tmp_path, seed, inputs=475)
+def test_damaged_input_is_read_or_refused(tmp_path: Path) -> None:
+    counts, failures = fuzz.fuzz(tmp_path, seed=1, inputs=475)
     assert not failures, failures
     assert {outcome for _, outcome in counts} == {"read", "refused"}
 

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import onnx
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from onnx import TensorProto, helper, numpy_helper
 
@@ -33,6 +33,7 @@ def weight(name: str = "w") -> onnx.TensorProto:
     return numpy_helper.from_array(np.ones(2, np.float32), name)
 
 
+@settings(max_examples=30)
 @given(st.dictionaries(st.text(max_size=9), st.text(max_size=300), max_size=5))
 def test_metadata(properties: dict[str, str]) -> None:
     model = with_tensors(weight())

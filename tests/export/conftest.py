@@ -8,22 +8,20 @@ import pytest
 
 from asca_export.bundle_writer import ExportOptions
 from asca_export.pillar.export import export_pillar_bundle
-from asca_pillars.config.pillar import CpaReading
-from tests.export.tiny import SCANS, tiny_checkpoint
+from tests.export.tiny import CHECKPOINTS, SCANS
 from tests.helpers.made_once import made_once
 
 
 @pytest.fixture(scope="session")
-def exported(tmp_path_factory: pytest.TempPathFactory) -> Callable[[CpaReading], Path]:
-    """The bundle of `tiny_checkpoint(reading)` in floating point, which no test changes."""
+def exported(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
+    """The bundle of a checkpoint, by its name in CHECKPOINTS, in floating point, which no test changes."""
 
     @cache
-    def export(cpa: CpaReading) -> Path:
+    def export(name: str) -> Path:
         def make(folder: Path) -> None:
-            export_pillar_bundle(
-                tiny_checkpoint(cpa), folder / cpa, SCANS, ExportOptions(trained_on="nothing", command="none")
-            )
+            stated = ExportOptions(trained_on="nothing", command="none")
+            export_pillar_bundle(CHECKPOINTS[name](), folder / name, SCANS, stated)
 
-        return made_once(tmp_path_factory, f"exported_{cpa}", make) / cpa
+        return made_once(tmp_path_factory, f"exported_{name}", make) / name
 
     return export

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from asca_deploy import Detector
+from asca_deploy import Detections, Detector
 from asca_deploy.bundle import MANIFEST
 from asca_pillars.models.checkpoint import Checkpoint
 from asca_pillars.models.scan_detector import ScanDetector
@@ -25,6 +25,13 @@ def changed_manifest(folder: Path, out: Path, change: Callable[[Any], object]) -
     return out
 
 
+def assert_same_boxes(found: Detections, expected: Detections, box: float = 1e-3, score: float = 1e-4) -> None:
+    """Within these tolerances; the labels are the same."""
+    np.testing.assert_array_equal(found.labels, expected.labels)
+    np.testing.assert_allclose(found.boxes, expected.boxes, atol=box)
+    np.testing.assert_allclose(found.scores, expected.scores, atol=score)
+
+
 def assert_same_detector(checkpoint: Checkpoint, folder: Path) -> None:
     """All boxes of the checkpoint and of the bundle in `folder`, whatever their score."""
     in_torch = ScanDetector(checkpoint.detector, checkpoint.config.model.spec.with_score_threshold(0.0))
@@ -32,9 +39,7 @@ def assert_same_detector(checkpoint: Checkpoint, folder: Path) -> None:
     found = [in_onnx(scan) for scan in SCANS]
     assert sum(map(len, found)) > 0
     for scan, detections in zip(SCANS, found, strict=True):
-        expected = in_torch(scan)
-        np.testing.assert_allclose(detections.boxes, expected.boxes, atol=1e-2)
-        np.testing.assert_allclose(detections.scores, expected.scores, atol=1e-3)
+        assert_same_boxes(detections, in_torch(scan), box=1e-2, score=1e-3)
     assert set(found[0].report.times_ms) == {"input", *in_onnx.pipeline.stages}
     for streamed, alone in zip(in_onnx.stream(SCANS), found, strict=True):
         np.testing.assert_array_equal(streamed.boxes, alone.boxes)

@@ -1,6 +1,7 @@
 """An 8-bit bundle, from the checkpoint to boxes."""
 
 import shutil
+from collections import defaultdict
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -16,12 +17,12 @@ from asca_export import graphs, int8
 from asca_export.bundle_writer import ExportOptions
 from asca_export.pillar.export import export_pillar_bundle
 from asca_pillars.base.errors import ExportError
-from asca_pillars.config.pillar import CpaReading
 from asca_pillars.config.tree import pillar_spec
 from asca_pillars.models.pillar.network import PillarDetector
+from tests.export.sweeps import remembered
 from tests.export.tiny import CALIBRATION, SCANS, tiny_checkpoint
 
-Exports = Callable[[CpaReading], Path]
+Exports = Callable[[str], Path]
 
 
 def export_int8(folder: Path) -> PillarBundle:
@@ -81,6 +82,7 @@ def test_layers_that_hurt_stay_in_floating_point(
     whole = load_pillar_bundle(folder).quantization
     assert whole is not None
     monkeypatch.setattr(int8, "MAX_LOGIT_ERROR", 0.8 * whole.logit_rms_error)
+    monkeypatch.setattr(int8, "sweep", remembered({layer.layer: layer.logit_rms_error for layer in whole.layers}))
     bundle = quantize(exported("channel"), tmp_path / "bundle", CALIBRATION)
     report = bundle.quantization
     assert report is not None and report.logit_rms_error <= 0.8 * whole.logit_rms_error
@@ -98,6 +100,7 @@ def test_scans_that_cannot_calibrate(exported: Exports, tmp_path: Path, monkeypa
     with pytest.raises(ExportError, match="7 scans with points on the grid given to calibrate on"):
         quantize(exported("channel"), tmp_path / "a", [*CALIBRATION[:7], nothing])
     monkeypatch.setattr(int8, "MAX_LOGIT_ERROR", 0.0)
+    monkeypatch.setattr(int8, "sweep", remembered(defaultdict(lambda: 1.0)))
     with pytest.raises(ExportError, match="an 8-bit canvas alone moves the class logits"):
         quantize(exported("channel"), tmp_path / "b", CALIBRATION)
 

@@ -1,6 +1,8 @@
 """Checkpoints small enough to be exported again and again, and scans for them."""
 
 import dataclasses
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -29,6 +31,17 @@ def tiny_checkpoint(cpa: CpaReading, spec: PillarSpec = SPEC, **network: Any) ->
 def sparse_checkpoint(rule: str) -> Checkpoint:
     spec = SPEC.with_score_threshold(0.02)  # random weights are never sure of anything
     return tiny_checkpoint("channel", spec, neck="sparse", active_cells=rule)
+
+
+READINGS: tuple[CpaReading, ...] = ("none", "paper", "channel", "point", "linear")
+POOLED = dataclasses.replace(SPEC, grid=dataclasses.replace(SPEC.grid, map="pooled")).with_score_threshold(0.02)
+CHECKPOINTS: dict[str, Callable[[], Checkpoint]] = {
+    **{cpa: partial(tiny_checkpoint, cpa) for cpa in READINGS},
+    **{rule: partial(sparse_checkpoint, rule) for rule in ("sub", "fine")},
+    "pooled": partial(tiny_checkpoint, "channel", POOLED),
+    "pooled_sparse": partial(tiny_checkpoint, "channel", POOLED, neck="sparse"),
+}
+"""One for each reading of the attention, rule of active cells and map."""
 
 
 def tiny_detector(cpa: CpaReading, spec: PillarSpec = SPEC, **network: Any) -> PillarDetector:

@@ -192,13 +192,8 @@ def test_every_layer_keeps_its_line_in_the_legend():
 
 
 def test_boxes_on_the_image_take_given_colors():
-    calib = Calibration(
-        p2=np.array([[700.0, 0, 250, 0], [0, 700, 150, 0], [0, 0, 1, 0]]),
-        r0_rect=np.eye(3),
-        camera_from_lidar=np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0]]),
-    )
-    image, box = np.zeros((300, 500, 3), np.uint8), np.array([[12.0, 0, 0, 4, 2, 2, 0]])
-    drawn = draw_on_image(image, box, [""], None, calib, colors=[(255, 0, 255)])
+    box = np.array([[12.0, 0, 0, 4, 2, 2, 0]])
+    drawn = draw_on_image(np.zeros_like(GRAY), box, [""], None, CALIB, colors=[(255, 0, 255)])
     assert len(near(drawn, (255, 0, 255))[0]) > 100
     assert not drawn[..., 1].any()  # an empty text leaves no mark
 

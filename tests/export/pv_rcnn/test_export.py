@@ -42,7 +42,8 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Trained:
     """A trained checkpoint with every module that the papers add, and the bundle exported from it."""
 
     def make(folder: Path) -> None:
-        config = tiny_config(dataclasses.replace(MODEL, **EVERYTHING), epochs=1)
+        settings = dataclasses.replace(EVERYTHING["settings"], scale_samples=2)
+        config = tiny_config(dataclasses.replace(MODEL, **EVERYTHING | {"settings": settings}), epochs=1)
         last = train(config, write_dataset(folder / "data", 5), folder / "run")
         export_pv_rcnn_bundle(load_checkpoint(last), folder / "bundle", SCANS)
 

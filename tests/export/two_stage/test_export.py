@@ -30,6 +30,7 @@ from asca_pillars.models.two_stage.first_stage import with_first_stage
 from asca_pillars.models.two_stage.network import RefineDetector
 from asca_pillars.training.loop import train
 from tests.export.deployed import assert_same_detector, changed_manifest
+from tests.export.sweeps import all_at_once
 from tests.export.tiny import CALIBRATION, SCANS, tiny_checkpoint
 from tests.helpers.made_once import made_once
 from tests.helpers.saved_checkpoint import save_checkpoint
@@ -90,7 +91,10 @@ def test_a_sparse_neck_on_a_pooled_map_proposes(trained: tuple[Path, Path], tmp_
     assert len(runtime(np.empty((0, 4), np.float32))) == 0
 
 
-def test_the_first_stage_in_eight_bits(trained: tuple[Path, Path], tmp_path: Path) -> None:
+def test_the_first_stage_in_eight_bits(
+    trained: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("asca_export.int8.sweep", all_at_once)
     checkpoint = load_checkpoint(trained[0])
     quantized = export_refine_bundle(
         checkpoint, tmp_path / "a", SCANS, ExportOptions(calibration=CALIBRATION, weights=trained[0])
@@ -114,6 +118,7 @@ def test_eight_bits_of_other_weights_are_refused(
 ) -> None:
     """A bundle's 8-bit form goes by its name; another network may stand there."""
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("asca_export.int8.sweep", all_at_once)
     save_checkpoint(Path("first.ckpt"), tiny_checkpoint("channel"))
     export_pillar_bundle(tiny_checkpoint("channel"), "first", SCANS, ExportOptions(weights=Path("first.ckpt")))
     checkpoint = on_first_stage(Path("first"), trained)
