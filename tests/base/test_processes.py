@@ -55,12 +55,12 @@ class TwoArgumentsError(Exception):
 
 @pytest.mark.parametrize("workers", [1, 2])
 def test_the_error_of_a_job_is_raised(workers: int) -> None:
-    odd = TypeError if workers > 1 else TwoArgumentsError
-    for number, error, message in ((-1, DatasetError, "-1: is negative"), (1000, odd, "second")):
-        results = map_in_processes(square, [3, number, 2], workers, "Squares", at_once=1, progress=False)
-        assert next(results)[0] == 9
-        with pytest.raises(error, match=message):
-            next(results)
+    results = map_in_processes(square, [3, -1, 2], workers, "Squares", at_once=1, progress=False)
+    assert next(results)[0] == 9
+    with pytest.raises(DatasetError, match="-1: is negative"):
+        next(results)
+    with pytest.raises(TypeError if workers > 1 else TwoArgumentsError, match="second"):
+        list(map_in_processes(square, [3, 1000, 2], workers, "Squares", at_once=1, progress=False))
 
 
 def unhurried(number: int) -> int:
