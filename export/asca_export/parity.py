@@ -149,7 +149,8 @@ def require_same_refined(
         ExportError: a box without a partner within the tolerances.
     """
     spec = spec.with_score_threshold(0.0)
-    spec = replace(spec, post=replace(spec.post, nms_iou=1.0, max_detections=max(len(proposals), 1)))
+    post = replace(spec.post, nms_iou=1.0, vote_iou=None, max_detections=max(len(proposals), 1))
+    spec = replace(spec, post=post)
     boxes, partners = (reported_detections(proposals, *answer, spec, scores) for answer in (expected, found))
     difference, lone = match_nearest(boxes, partners)
     if len(lone):
@@ -168,6 +169,7 @@ def compare_boxes(
 
     Thresholds are lowered until the best COMPARED_ANCHORS of each class take part, and all boxes are kept. Before
     suppression only thresholds can explain a difference; after it, ties between overlapping boxes of equal score can.
+    No box votes: all that could have been compared, and whether one has a vote can hang on a rounding.
 
     Args:
         expected, found: maps, or rows of the same head cells.
@@ -182,7 +184,7 @@ def compare_boxes(
         replace(class_, score_threshold=min(class_.score_threshold, _score_of_rank(logits)))
         for class_, logits in zip(spec.classes, by_class(expected.scores, spec), strict=True)
     )
-    uncut = replace(spec.post, max_detections=spec.post.candidates * len(classes))
+    uncut = replace(spec.post, vote_iou=None, max_detections=spec.post.candidates * len(classes))
     worst = LargestDifferences(0.0, 0.0)
     for post in (replace(uncut, nms_iou=1.0), uncut):
         lowered = replace(spec, classes=classes, post=post)

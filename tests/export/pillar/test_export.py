@@ -1,6 +1,7 @@
 """From a checkpoint to a proven bundle: parity for every reading, and refusal when the graphs are not the model."""
 
 import json
+import math
 import os
 import shutil
 from collections.abc import Callable
@@ -178,6 +179,22 @@ def test_ties_are_no_differences() -> None:
     left[0, 10, 10], left[0, 10, 11] = 2.0, 2.0 - 1e-6
     right[0, 10, 10], right[0, 10, 11] = 2.0 - 1e-6, 2.0
     compare_boxes(maps._replace(scores=left), maps._replace(scores=right), FEW)
+
+
+def test_a_vote_that_hangs_on_a_rounding_is_no_difference() -> None:
+    """The second box reaches its threshold on one side alone, and moves the first one there."""
+    maps, spec = _maps(0), replace(FEW, post=replace(FEW.post, vote_iou=0.3))
+    maps.scores[:], maps.boxes[:] = -20, 0
+    threshold = FEW.classes[0].score_threshold
+    logit = math.log(threshold / (1 - threshold))
+    sides = []
+    for rounding in (-1e-6, 1e-6):
+        scores = maps.scores.copy()
+        scores[0, 10, 10], scores[0, 10, 11] = logit + 1, logit + rounding
+        sides.append(maps._replace(scores=scores))
+    (alone,), (voted,) = (spec.decode(side).boxes for side in sides)
+    assert np.abs(alone - voted).max() > 0.01
+    compare_boxes(*sides, spec)
 
 
 def test_an_overlap_as_large_as_suppression_allows_is_a_tie() -> None:
