@@ -155,6 +155,15 @@ def test_an_anchor_of_two_boxes_goes_to_the_one_whose_best_it_is() -> None:
             assert taken[(3 * 9 + 3) * COUNT] == order.index(fitting)
 
 
+@pytest.mark.parametrize("assigner", ["overlap", "atss"])
+def test_a_positive_anchor_is_not_ignored(assigner: Assigner) -> None:
+    """A van, which is ignored, stands where a car does: the car is learnt all the same."""
+    car = [4.0, 3.0, -1.0, 3.9, 1.6, 1.56, 0.0]
+    alone, beside = (assign((CAR, car), *also, anchors=SQUARE, assigner=assigner) for also in ((), ((IGNORED, car),)))
+    assert len(alone.positives) > 0 and beside.positives.tolist() == alone.positives.tolist()
+    assert (beside.state.flat[beside.positives] == 1).all()
+
+
 def test_fewer_cells_than_candidates() -> None:
     few = make_anchors(np.arange(2.0), np.arange(3.0), KITTI_CLASSES)
     targets = assign((CYCLIST, [1.0, 2.0, -0.6, 1.76, 0.6, 1.73, 0.0]), anchors=few, assigner="atss")
