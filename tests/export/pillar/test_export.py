@@ -194,7 +194,8 @@ def test_a_vote_that_hangs_on_a_rounding_is_no_difference() -> None:
         sides.append(maps._replace(scores=scores))
     (alone,), (voted,) = (spec.decode(side).boxes for side in sides)
     assert np.abs(alone - voted).max() > 0.01
-    compare_boxes(*sides, spec)
+    below, above = sides
+    compare_boxes(below, above, spec)
 
 
 def test_an_overlap_as_large_as_suppression_allows_is_a_tie() -> None:
