@@ -5,6 +5,7 @@ from typing import ClassVar, Literal
 
 from asca_pillars.base.errors import ConfigError
 from asca_pillars.base.strict import Strict, require_bounds
+from asca_pillars.config.two_stage import require_no_votes
 from asca_pillars.detection.proposals import AnchorProposals
 from asca_pillars.ops.pv_rcnn.prepare import VoxelSetSettings
 from asca_pillars.ops.pv_rcnn.spec import VoxelSpec
@@ -103,6 +104,7 @@ class PvRcnnModel(Strict):
 
     def __post_init__(self) -> None:
         require_bounds("model", self, ("rois",), low=2)
+        require_no_votes(self.spec.post)
         if len(self.network.source_widths) != len(self.settings.sources):
             raise ConfigError(
                 f"model.network.source_widths has {len(self.network.source_widths)} entries: give one for each of "

@@ -5,6 +5,7 @@ from typing import Literal
 
 from asca_pillars.base.errors import ConfigError
 from asca_pillars.base.strict import Strict, require_bounds
+from asca_pillars.detection.decode import PostProcess
 from asca_pillars.ops.pillar.spec import PillarSpec
 from asca_pillars.ops.two_stage.decode import Scores
 from asca_pillars.ops.two_stage.first_stage import FirstStageSettings
@@ -59,6 +60,14 @@ class RefineConfig(Strict):
         require_bounds("model.refine", self, ("rois",), low=2)
 
 
+def require_no_votes(post: PostProcess) -> None:
+    """Raise ConfigError if boxes of two stages are to vote: refined ones were better alone (docs/MODEL_CARD.md)."""
+    if post.vote_iou is not None:
+        raise ConfigError(
+            f"model.spec.post.vote_iou = {post.vote_iou:g}: the boxes of a second stage do not vote; leave it out"
+        )
+
+
 @dataclass(frozen=True)
 class RefineModel(Strict):
     """A second stage that refines the proposals of a trained pillar detector, which stays as it is.
@@ -90,3 +99,4 @@ class RefineModel(Strict):
                 f"{', '.join(self.spec.class_names)}"
             )
         require_bounds("model", self, ("bev_channels",), low=0)
+        require_no_votes(self.spec.post)

@@ -2,6 +2,7 @@
 
 import math
 import reprlib
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Generic, NamedTuple, TypeVar
 
@@ -19,6 +20,9 @@ KERNELS = "asca_pillars.geometry.nms_kernels"
 
 LEAST_LOGIT = -1e3
 """Least logit of a detection; its score is 0 in every type. A masked neck's inactive cells lie below."""
+
+VOTE_SCORE = 0.1
+"""Score from which on a box votes, reported or not, so that score thresholds do not move boxes."""
 
 MOST = 2**31 - 1
 """Upper bound of counts in settings: the largest 32-bit index."""
@@ -67,7 +71,10 @@ class HeadMaps(NamedTuple, Generic[Map]):
 
 
 class Candidates(NamedTuple):
-    """Decoded boxes that enter suppression, class by class, the best of each class first."""
+    """Decoded boxes that enter suppression, class by class, the best of each class first.
+
+    Where boxes vote, those from VOTE_SCORE on are among them.
+    """
 
     boxes: NDArray[np.float32]
     """(n, 7), LiDAR frame."""
@@ -89,9 +96,10 @@ def decode(
 ) -> Detections:
     """Decode the detections of one scan, best first.
 
-    Per class: the anchors whose score reaches the class's threshold, the best `candidates` of them, decoded,
-    rotated BEV NMS, and with `vote_iou` box voting. Then the best `max_detections` of all classes. Anchors whose
-    numbers are not finite, from a network that overflowed, are left out and counted (`Detections.non_finite`).
+    Per class: the anchors whose score reaches the class's threshold, the best `candidates` of them, decoded, rotated
+    BEV NMS. With `vote_iou` anchors from VOTE_SCORE on take part, too, and vote on the boxes. Then the best
+    `max_detections` of all classes. Anchors whose numbers are not finite, from a network that overflowed, are left out
+    and counted (`Detections.non_finite`).
 
     Args:
         maps: logits and residuals on the head's map.
@@ -113,7 +121,7 @@ def decode_candidates(
     cells: NDArray[np.integer[Any]] | None = None,
     direction_offset_rad: float = DIRECTION_OFFSET_RAD,
 ) -> Candidates:
-    """Return candidates that reach their class's threshold, for `suppress`: (n, 7) boxes in the LiDAR frame.
+    """Return candidates that reach their class's threshold, or VOTE_SCORE where boxes vote, for `suppress`.
 
     Raises:
         ValueError: if maps, anchors and classes do not belong together.
@@ -134,7 +142,10 @@ def decode_candidates(
     if per_anchor > 1:
         every = scores.reshape(-1, count, per_anchor)
         scores, labels = every.max(axis=2), every.argmax(axis=2)  # one that is not a number stays so
-    anchor, row = _candidates(scores, labels, classes, post.candidates)
+    least = [each.score_threshold for each in classes]
+    if post.vote_iou is not None:
+        least = [min(score, VOTE_SCORE) for score in least]
+    anchor, row = _candidates(scores, labels, least, post.candidates)
     cell = row if cells is None else cells[row]
     logits = scores[row, anchor]
     residuals = rows.boxes.reshape(-1, count, 7)[row, anchor]
@@ -157,11 +168,14 @@ def suppress(
 ) -> Detections:
     """Suppress (n, 7) candidates by the rotated NMS of their class, the second half of `decode`; best first.
 
-    At most `most` of each class are kept. With `post.vote_iou` the others vote on their boxes.
+    At most `most` of each class are kept. With `post.vote_iou` the others vote on their boxes; those below their
+    class's threshold only do that.
     """
     boxes, logits, labels, non_finite = candidates
     limit = post.max_detections if most is None else min(most, post.max_detections)
     survivors = nms_by_class(boxes, logits, labels, post.nms_iou, limit)
+    thresholds = np.array([_logit(spec.score_threshold) for spec in classes])
+    survivors = survivors[logits[survivors] >= thresholds[labels[survivors]]]
     best = survivors[np.argsort(-logits[survivors], kind="stable")[: post.max_detections]]
     scores = sigmoid(logits)
     return Detections(
@@ -235,11 +249,11 @@ def vote_boxes(
 
 
 def _candidates(
-    scores: NDArray[np.float32], labels: NDArray[np.int64] | None, classes: tuple[ClassSpec, ...], limit: int
+    scores: NDArray[np.float32], labels: NDArray[np.int64] | None, least: Sequence[float], limit: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return anchor (n,) and row (n,) in scores (M, A) of the best anchors of each class, class by class, best first.
 
-    `labels` (M, A) are the classes of the scores; None: each anchor's class.
+    `labels` (M, A) are the classes of the scores; None: each anchor's class. `least` is the lowest score of each class.
 
     Of equal scores that of the earlier anchor goes first, and among those that of the earlier row.
     """
@@ -247,7 +261,7 @@ def _candidates(
     # The backbone's maps lie in memory with the channels last: no copy, and one look at every logit. Logits are
     # compared rather than scores: the sigmoid is monotonic, and few anchors ever need it.
     logits = scores.reshape(-1)
-    floors = [_logit(spec.score_threshold) for spec in classes]
+    floors = [_logit(score) for score in least]
     above = np.flatnonzero(logits >= min(floors))
     logits = logits[above]
     row, anchor = np.divmod(above, count)

@@ -26,6 +26,7 @@ from asca_pillars.config.two_stage import RefineModel
 from asca_pillars.data.open_split import open_split
 from asca_pillars.data.require_boxes import require_boxes
 from asca_pillars.models.checkpoint_file import save_weights
+from asca_pillars.models.pillar.distillation import Distillation
 from asca_pillars.models.two_stage.first_stage import with_first_stage
 from asca_pillars.training.callbacks import RunProgress, SaveOnInterrupt, weight_average
 from asca_pillars.training.checkpoints import (
@@ -85,7 +86,7 @@ def train(
         TrainingInterruptedError: Ctrl-C; the run is saved.
         OutputError: another process trains in `out`.
         DatasetError, ScanError: the data cannot be read, or no training frame has a box of any class.
-        BundleError, ExportError, ConfigError: the first stage of two cannot be used.
+        BundleError, ExportError, ConfigError: the first stage of two, or the teacher, cannot be used.
     """
     # The processes of one run share its folder: the first holds it.
     with only_writer(out, COMMAND) if getattr(rank_zero_only, "rank", 0) == 0 else nullcontext():
@@ -116,6 +117,7 @@ def _train(
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
     # Arguments are checked before minutes of work, and before the folder is claimed for this run.
     weights = None if goes_on and init is None else initial_weights(config, init)
+    distillation = Distillation(config, config.train.teacher) if config.train.teacher else None
     files = AtomicCheckpointIO(keep_last=damage is None)
     last = LastCheckpoint(checkpoints, config.train.checkpoint_steps)
     interrupt = SaveOnInterrupt(last)
@@ -137,7 +139,8 @@ def _train(
         say(f"train.precision = bf16: this device has no bfloat16 and is many times slower in it; {remedy}")
     L.seed_everything(config.train.seed, verbose=False)
     keep = goes_on or not trainer.is_global_zero  # else it may be of scans that were there before
-    module = DetectionModule(config, measure_input(out, data.training_set.frames, keep=keep, bar=remark is None))
+    measured = measure_input(out, data.training_set.frames, keep=keep, bar=remark is None)
+    module = DetectionModule(config, measured, distillation)
     if weights and not goes_on:
         module.detector.load_state_dict(module.detector.state_dict() | weights)
     with warnings.catch_warnings(), interrupt.listening():

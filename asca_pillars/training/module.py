@@ -28,16 +28,22 @@ class DetectionModule(L.LightningModule):
     Args:
         config: of the run.
         expected_input: of its training scans; it goes into every checkpoint.
+        distillation: what a teacher adds to the loss; None for no teacher.
     """
 
-    def __init__(self, config: Config, expected_input: ExpectedInput | None = None) -> None:
+    def __init__(
+        self,
+        config: Config,
+        expected_input: ExpectedInput | None = None,
+        distillation: Distillation | None = None,
+    ) -> None:
         super().__init__()
         measured = None if expected_input is None else to_dict(expected_input)
         self.save_hyperparameters({"config": to_dict(config), "expected_input": measured})
         self.config = config
         self.detector = build_model(config.model)
         self.recall = RecallTally(config.model.spec.class_names)
-        self._distill = Distillation(config, config.train.teacher) if config.train.teacher else None
+        self._distill = distillation
 
     def training_step(self, batch: Batch | AscaError, _: int) -> Tensor:
         """Return the loss of one batch, a scalar.

@@ -74,8 +74,9 @@ def golden_stages(pipeline: PillarPipeline | RefinePipeline, points: NDArray[np.
     """Return the arrays of each stage, by stage and name, for finite points (N, 4), metres, reflectance within 0..1.
 
     Stages, for M points in P pillars: `input`, `pillarize`, `encode`, `scatter` (or `rulebooks` of a sparse neck),
-    `neck+head`, `decode` (n boxes above their thresholds) and `suppress` (those that stay). With a second stage, after
-    `neck+head`: `propose`, `neighbors`, `refine` and `suppress`. Maps are channels last, as the graph gives them.
+    `neck+head`, `decode` (n boxes that enter suppression) and `suppress` (those that are reported). With a second
+    stage, after `neck+head`: `propose`, `neighbors`, `refine` and `suppress`. Maps are channels last, as the graph
+    gives them.
     """
     first = pipeline if isinstance(pipeline, PillarPipeline) else pipeline.first
     pillars = first.pillarize(points)

@@ -22,6 +22,7 @@ struct Box {
 namespace detail {
 
 constexpr double kPi = 3.14159265358979323846;
+constexpr double kVoteScore = 0.1;  // from which on a box votes, reported or not
 using Point = std::array<double, 2>;
 
 inline double modulo(double value, double divisor) { return value - divisor * std::floor(value / divisor); }
@@ -132,8 +133,9 @@ inline std::vector<Box> detections(const float* scores, const float* residuals, 
     std::vector<Box> all;
     for (size_t label = 0; label < classes.size(); ++label) {
         const auto& size = classes[label];
-        const double threshold = size.at("score_threshold");
-        const double floor = std::log(threshold / (1 - threshold));
+        const auto logit_of = [](double score) { return std::log(score / (1 - score)); };
+        const double threshold = logit_of(size.at("score_threshold"));
+        const double floor = vote_iou ? std::min(threshold, logit_of(detail::kVoteScore)) : threshold;
         std::vector<std::tuple<float, int64_t, int64_t>> chosen;  // logit downwards, anchor, row
         for (int64_t anchor = label * turns; anchor < static_cast<int64_t>(label + 1) * turns; ++anchor)
             for (int64_t row = 0; row < rows; ++row)
@@ -159,7 +161,8 @@ inline std::vector<Box> detections(const float* scores, const float* residuals, 
                                             [](float value) { return std::isfinite(value); });
             const auto clashes = [&](const Box& other) { return detail::bev_iou(other, found) > nms_iou; };
             if (finite) entered.push_back(found);
-            if (finite && kept.size() < most && std::none_of(kept.begin(), kept.end(), clashes)) kept.push_back(found);
+            const bool reported = -negative >= threshold;
+            if (finite && reported && kept.size() < most && std::none_of(kept.begin(), kept.end(), clashes)) kept.push_back(found);
         }
         for (const Box& own : kept) all.push_back(vote_iou ? detail::voted(own, entered, *vote_iou) : own);
     }

@@ -149,8 +149,7 @@ def require_same_refined(
         ExportError: a box without a partner within the tolerances.
     """
     spec = spec.with_score_threshold(0.0)
-    post = replace(spec.post, nms_iou=1.0, vote_iou=None, max_detections=max(len(proposals), 1))
-    spec = replace(spec, post=post)
+    spec = replace(spec, post=replace(spec.post, nms_iou=1.0, max_detections=max(len(proposals), 1)))
     boxes, partners = (reported_detections(proposals, *answer, spec, scores) for answer in (expected, found))
     difference, lone = match_nearest(boxes, partners)
     if len(lone):

@@ -77,7 +77,7 @@ def test_what_the_user_has_set_stays(
 
 
 class Watch:
-    """What the environment says where onnxruntime is imported, which is as if it were not there."""
+    """Records what the environment states when onnxruntime is imported, and lets the import fail."""
 
     stated: str | None = None
 

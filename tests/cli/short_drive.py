@@ -14,7 +14,7 @@ from tests.scans.recordings.cloud_recordings import laid_out, stamps, write_mcap
 SAMPLE = read_scan(sample_scan_path()).points
 _NEAR = (SAMPLE[:, 0] > 2) & (SAMPLE[:, 0] < 30) & (np.abs(SAMPLE[:, 1]) < 12)
 POINTS = SAMPLE[::4][_NEAR[::4]].copy()
-"""Of the sample, what is near and ahead: one pass of a small model finds several cars and a pedestrian in it."""
+"""A quarter of the sample's near points ahead. One pass of a small model finds several cars and a pedestrian there."""
 SCANS = 5
 BUNDLE = Path("fast")
 

@@ -113,7 +113,7 @@ def test_a_folder_of_shards_that_is_a_link_or_somebody_else_s_is_left_alone(clus
 
 
 def test_another_run_is_refused(cluster: Cluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of other scores or another bundle, and of scans of the same names below another folder."""
+    """A run differs if scores or bundle do, and if scans of the same names lie below another folder."""
     for day in ("monday", "tuesday"):
         shutil.copytree(cluster.scans, tmp_path / day / "scans")
     monkeypatch.chdir(tmp_path / "monday")

@@ -216,6 +216,10 @@ CAR = "length_m: 9, width_m: 2.5, height_m: 3.2, z_m: -0.2, positive_iou: 0.6, n
             "max_pillars = 5: must be at least 6 with cpa paper",
         ),
         (
+            "model: {kind: pv_rcnn, spec: {post: {vote_iou: 0.6}}}",
+            "model.spec.post.vote_iou = 0.6: the boxes of a second stage do not vote; leave it out",
+        ),
+        (
             f"model: {{spec: {{classes: [{{name: Car, {CAR}}}, {{name: car, {CAR}}}]}}}}",
             "classes Car, car must have different names",
         ),

@@ -34,9 +34,6 @@ from tests.helpers.bundles import DENSE_FLOAT32, DENSE_INT8
 ORT_WEB = os.environ.get("ASCA_ORT_WEB")
 """npm's package onnxruntime-web, a .tgz or its folder."""
 NEAR_M = 0.02
-# The page lets all boxes vote that its sliders reach, Python those that it reports, which moves the weakest boxes most.
-# Votes of the same boxes are compared to 1e-5 in test_browser_modules.py.
-VOTES_M = 0.3
 SCORE_TOLERANCE = 0.02
 
 MODELS = shipped_bundles() | {folder.name: folder for folder in (DENSE_FLOAT32, DENSE_INT8)}
@@ -192,8 +189,7 @@ def assert_same(saved: Any, detector: Detector, points: NDArray[np.float32], lea
     centers = np.array([[box["x_m"], box["y_m"], box["z_m"]] for box in saved["boxes"]])
     scores = np.array([box["score"] for box in saved["boxes"]])
     np.testing.assert_allclose(scores, expected.scores, atol=SCORE_TOLERANCE)
-    near_m = NEAR_M if detector.spec.post.vote_iou is None else VOTES_M
-    far = np.linalg.norm(centers - expected.boxes[:, :3], axis=1) >= near_m
+    far = np.linalg.norm(centers - expected.boxes[:, :3], axis=1) >= NEAR_M
     if detector.bundle.precision == "int8":
         # A rounding can decide between two candidates of one object whose scores tie; Python has both.
         assert far.sum() <= 1

@@ -236,5 +236,9 @@ def test_only_with_votes_does_suppression_change_a_box() -> None:
     weights = np.array([1 / (1 + math.exp(-2)) ** 2, overlap / (1 + math.exp(-1)) ** 2])
     np.testing.assert_allclose(voted[0] - center[0], 0.4 * weights[1] / weights.sum(), atol=1e-5)
     np.testing.assert_allclose(voted[1:], center[1:], atol=1e-5)
+    lower, higher = (dataclasses.replace(CLASSES[0], score_threshold=score) for score in (0.2, 0.85))
+    (reported,) = decode(maps, ANCHORS, (higher, *CLASSES[1:]), PostProcess(vote_iou=0.6)).boxes
+    (both,) = decode(maps, ANCHORS, (lower, *CLASSES[1:]), PostProcess(vote_iou=0.6)).boxes
+    np.testing.assert_array_equal([reported, both], [voted, voted])  # the other anchor votes without being reported
     with pytest.raises(ConfigError, match=r"vote_iou 1\.5 must lie between 0 and 1"):
         PostProcess(vote_iou=1.5)

@@ -24,7 +24,7 @@ angles = st.tuples(*[st.floats(-7, 7)] * 3)
 def test_quaternions_have_the_real_part_first_and_roll_comes_before_yaw(
     quaternions: list[tuple[float, ...]], angles: list[tuple[float, ...]]
 ) -> None:
-    """Of any length; about axes that stand still."""
+    """Quaternions may have any length; roll, pitch and yaw turn about axes that stand still."""
     assume(all(np.linalg.norm(one) > 1e-3 for one in quaternions))
     turned = Rotation.from_quat(np.array(quaternions)[:, [1, 2, 3, 0]]), Rotation.from_euler("xyz", np.array(angles))
     ours = rotations_from_quaternions, rotations_from_roll_pitch_yaw

@@ -82,7 +82,7 @@ def _find_weights(source: str, key: str) -> _Weights:
     try:
         data = json.loads(read_text(manifest, BundleError))
         kind, precision, provenance = str(data["kind"]), data["precision"], data["provenance"]
-        identity, digest = (str(provenance.get(key) or "") for key in ("weights_sha256", "weights_file_sha256"))
+        identity, digest = (str(provenance.get(name) or "") for name in ("weights_sha256", "weights_file_sha256"))
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         raise BundleError(f"{manifest}: cannot be read, or is damaged; copy the whole bundle again") from None
     require_pillar_kind(folder, kind)

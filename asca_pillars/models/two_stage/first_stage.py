@@ -88,7 +88,7 @@ def with_first_stage(model: RefineModel, stage: FirstStage | None = None) -> Ref
         raise ConfigError("model.spec is the first stage's where model.kind is pillar_refine: leave it out")
     if _geometry(model.spec) != _geometry(spec) and model.first_stage_identity:
         raise ConfigError(f"model.spec is not that of the first stage {model.first_stage}: train again")
-    # Votes improve the boxes of the first stage; refined ones were better alone.
+    # Votes improve the boxes of the first stage alone, see `RefineModel`.
     spec = replace(spec, post=replace(spec.post, vote_iou=None))
     channels = stage(np.empty((0, 4), np.float32)).neck.shape[-1]
     if model.bev_channels not in (0, channels):

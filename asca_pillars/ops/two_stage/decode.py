@@ -7,7 +7,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from asca_pillars.detection.decode import PostProcess, nms_by_class, sigmoid, vote_boxes
+from asca_pillars.detection.decode import PostProcess, nms_by_class, sigmoid
 from asca_pillars.detection.detections import Detections
 from asca_pillars.detection.spec import DetectorSpec
 from asca_pillars.ops.two_stage.rois import decode_refinement
@@ -63,7 +63,7 @@ def reported_frames(
 def refined_detections(
     proposals: Detections, scores: NDArray[np.float32], residuals: NDArray[np.float32], post: PostProcess
 ) -> Detections:
-    """Return refined boxes, best first, after NMS and votes within each class; non-finite ones are counted.
+    """Return refined boxes, best first, after rotated NMS within each class; non-finite ones are counted.
 
     Args:
         proposals: R of them.
@@ -76,7 +76,5 @@ def refined_detections(
     own = np.flatnonzero(usable)
     survivors = own[nms_by_class(boxes[own], scores[own], proposals.labels[own], post.nms_iou, post.max_detections)]
     best = survivors[np.argsort(-scores[survivors], kind="stable")[: post.max_detections]]
-    scores = scores.astype(np.float32)
-    votes = vote_boxes(boxes[own], scores[own], proposals.labels[own], np.searchsorted(own, best), post.vote_iou)
-    found = Detections(votes, scores[best], proposals.labels[best], proposals.class_names)
+    found = Detections(boxes[best], scores[best].astype(np.float32), proposals.labels[best], proposals.class_names)
     return replace(found, non_finite=int((~usable).sum()))

@@ -85,10 +85,10 @@ def require_pillar_kind(source: object, kind: str) -> None:
         kind: family of the detector.
 
     Raises:
-        ConfigError: the detector cannot be a first stage.
+        ConfigError: the detector is of another family.
     """
     if kind != "pillar":
-        raise ConfigError(f"{source}: model.kind {kind}; a first stage is of kind pillar")
+        raise ConfigError(f"{source}: model.kind {kind}; give a detector of kind pillar")
 
 
 def run_first_stage(stage: FirstStage, points: NDArray[np.float32], settings: FirstStageSettings) -> SecondStageInputs:

@@ -2,19 +2,24 @@
 
 const DIRECTION_OFFSET = Math.PI / 4; // where bundle.json does not say
 const MAX_LOG_RATIO = Math.log(100);
+const VOTE_SCORE = 0.1; // from which on a box votes, reported or not
 
 /**
- * Boxes above their class's threshold, class by class, the best first: those that enter suppression.
+ * Boxes that enter suppression, class by class, the best first: those above their class's threshold, and where boxes
+ * vote those above VOTE_SCORE, which are not `reported`.
  * @param {{scores: Float32Array, boxes: Float32Array, directions: Float32Array}} maps of the head, channels last
  * @param {object} grid of `makeGrid`
  * @param {object} spec of bundle.json
  * @param {number[]} yaws `pillar.layout.anchor_yaws_rad`
  * @param {Int32Array} [cells] of the head's map whose rows the maps hold, ascending; all of them if left out
- * @returns {{box: Float32Array, score: number, label: number}[]} box: x, y, z, length, width, height, yaw
+ * @returns {{box: Float32Array, score: number, label: number, reported: boolean}[]} box: x, y, z, length, width,
+ *   height, yaw
  */
 export function decodeCandidates(maps, grid, spec, yaws, cells) {
   const anchors = spec.classes.length * yaws.length;
-  const floors = spec.classes.map(({ score_threshold: score }) => Math.log(score / (1 - score)));
+  const logitOf = (score) => Math.log(score / (1 - score));
+  const thresholds = spec.classes.map(({ score_threshold: score }) => logitOf(score));
+  const floors = thresholds.map((least) => (spec.post.vote_iou == null ? least : Math.min(least, logitOf(VOTE_SCORE))));
   const offset = spec.direction_offset_rad ?? DIRECTION_OFFSET;
   const best = spec.classes.map(() => []);
   maps.scores.forEach((logit, index) => {
@@ -30,7 +35,8 @@ export function decodeCandidates(maps, grid, spec, yaws, cells) {
   return chosen
     .map(({ logit, anchor, row, label }) => {
       const own = anchorBox(grid, spec.classes[label], cells ? cells[row] : row, yaws[anchor % yaws.length]);
-      return { box: decodeBox(maps, row * anchors + anchor, own, offset), score: 1 / (1 + Math.exp(-logit)), label };
+      const [box, score] = [decodeBox(maps, row * anchors + anchor, own, offset), 1 / (1 + Math.exp(-logit))];
+      return { box, score, label, reported: logit >= thresholds[label] };
     })
     .filter(({ box, score }) => box.every(Number.isFinite) && Number.isFinite(score));
 }
@@ -62,12 +68,14 @@ function decodeBox(maps, place, [x, y, z, length, width, height, yaw], offset) {
 
 /**
  * Rotated non-maximum suppression within each class, seen from above; then the best of all classes, best first.
- * @param {{box: Float32Array, score: number, label: number}[]} candidates of `decodeCandidates`
+ * @param {{box: Float32Array, score: number, label: number, reported: ?boolean}[]} candidates of `decodeCandidates`, or
+ *   others, of which all are reported
  * @param {{nms_iou: number, max_detections: number, vote_iou: ?number}} post `spec.post` of bundle.json
  */
 export function suppress(candidates, post) {
   const kept = [];
   for (const candidate of candidates) {
+    if (candidate.reported === false) continue;
     const own = kept.filter((other) => other.label === candidate.label);
     if (own.length < post.max_detections && own.every((other) => bevIou(other.box, candidate.box) <= post.nms_iou)) {
       kept.push(candidate);

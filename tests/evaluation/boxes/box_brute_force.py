@@ -120,7 +120,7 @@ def nuscenes_errors(box: Box, other: Box) -> list[float]:
 
 
 def argoverse_errors(box: Box, other: Box) -> list[float]:
-    # Of each extent the smaller one over the larger one.
+    # Each extent counts with the ratio of the smaller one to the larger one.
     kept = math.prod(min(a, b) / max(a, b) for a, b in zip(box[3:6], other[3:6], strict=True))
     return [math.dist(box[:3], other[:3]), 1 - kept, turned(box, other)]
 

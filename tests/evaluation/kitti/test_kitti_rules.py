@@ -1,4 +1,4 @@
-"""What is evaluated, what is false, and the curves, by inputs of a few boxes; test_average_precision has many."""
+"""Rules and curves of KITTI's evaluation on a few boxes; test_average_precision has many."""
 
 from dataclasses import replace
 

@@ -23,7 +23,7 @@ from asca_export.pillar.export import export_pillar_bundle
 from asca_pillars.base.errors import ExportError
 from asca_pillars.config.pillar import PillarModel
 from asca_pillars.data.kitti import KittiSplit
-from asca_pillars.detection.decode import HeadMaps
+from asca_pillars.detection.decode import VOTE_SCORE, HeadMaps
 from asca_pillars.models.pillar.network import PillarDetector
 from asca_pillars.models.scan_detector import ScanDetector
 from asca_pillars.ops.pillar.spec import PillarSpec
@@ -182,15 +182,14 @@ def test_ties_are_no_differences() -> None:
 
 
 def test_a_vote_that_hangs_on_a_rounding_is_no_difference() -> None:
-    """The second box reaches its threshold on one side alone, and moves the first one there."""
+    """The second box reaches VOTE_SCORE on one side alone, and moves the first one there."""
     maps, spec = _maps(0), replace(FEW, post=replace(FEW.post, vote_iou=0.3))
     maps.scores[:], maps.boxes[:] = -20, 0
-    threshold = FEW.classes[0].score_threshold
-    logit = math.log(threshold / (1 - threshold))
+    logit = math.log(VOTE_SCORE / (1 - VOTE_SCORE))
     sides = []
     for rounding in (-1e-6, 1e-6):
         scores = maps.scores.copy()
-        scores[0, 10, 10], scores[0, 10, 11] = logit + 1, logit + rounding
+        scores[0, 10, 10], scores[0, 10, 11] = -0.5, logit + rounding
         sides.append(maps._replace(scores=scores))
     (alone,), (voted,) = (spec.decode(side).boxes for side in sides)
     assert np.abs(alone - voted).max() > 0.01

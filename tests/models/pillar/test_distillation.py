@@ -90,6 +90,13 @@ def test_a_teacher_is_learnt_from_and_in_no_checkpoint(tmp_path: Path, teacher: 
     assert torch.equal(alone["head.scores.weight"], untaught["head.scores.weight"])
 
 
+def test_a_missing_teacher_is_said_before_the_folder_is_claimed(tmp_path: Path) -> None:
+    data = write_dataset(tmp_path / "data", 3)
+    with pytest.raises(BundleError, match=r"set train\.teacher"):
+        train(with_train(teacher="nowhere"), data, tmp_path / "run")
+    assert not (tmp_path / "run" / "config.yaml").exists() and not (data / "prepared").exists()
+
+
 def test_teachers_that_do_not_fit_are_refused(teacher: str, tmp_path: Path) -> None:
     Distillation(CONFIG, teacher)
     Distillation(with_network(pillar_channels=8, upsample_channels=8), teacher)  # a smaller detector

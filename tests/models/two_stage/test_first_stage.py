@@ -138,5 +138,5 @@ def test_bundles_whose_weights_cannot_be_taken(tmp_path: Path) -> None:
 
 
 def test_two_stages_are_no_first_stage() -> None:
-    with pytest.raises(ConfigError, match=r"a_bundle: model.kind pillar_refine; a first stage is of kind pillar"):
+    with pytest.raises(ConfigError, match=r"a_bundle: model.kind pillar_refine; give a detector of kind pillar"):
         require_pillar_kind("a_bundle", "pillar_refine")
