@@ -28,7 +28,9 @@ from rich.progress import track
 from asca_deploy import Detector
 from asca_deploy.pv_rcnn.pipeline import PvRcnnPipeline
 from asca_pillars.base.errors import ConfigError
+from asca_pillars.base.progress import Reporter
 from asca_pillars.base.system import cpu_model
+from asca_pillars.cli.progress import Bars
 from asca_pillars.cli.run_command import run_command
 from asca_pillars.data.kitti import KittiSplit
 from asca_pillars.detection.decode import PostProcess
@@ -84,7 +86,8 @@ def _refined(path: Path, frames: KittiSplit) -> tuple[dict[str, Refined], PostPr
     settings = detector.model.refine
     stage = open_first_stage(detector.model.first_stage)
     cache = ProposalCache(Path(frames.root) / "prepared", frames.pool, stage, settings.seen)
-    cache.fill(frames, console=Console(markup=False))
+    with Bars(Console(markup=False, stderr=True)) as bars:
+        cache.fill(frames, reporter=Reporter(bars))
     found = {}
     for frame_id in frames.frame_ids:
         proposed, points = cache.files.read(frame_id), frames.points(frame_id, camera_view=True)

@@ -126,6 +126,7 @@ def test_a_model_and_its_predictions_get_the_same_figures(tmp_path: Path, printe
 
 def test_simulated_scans_are_trained_on_and_exported(tmp_path: Path, printed: pytest.CaptureFixture[str]) -> None:
     steps = Steps()
+    remarks: list[str] = []
     made = simulate(tmp_path / "sim", 1, view="camera", progress=steps)
     assert made.frames == len(list(made.scans.iterdir())) == 1 and steps.last_of("Simulating") == (1, 1)
     drives = simulate(tmp_path / "drives", sequences=1, length=2, config="vlp_16")
@@ -133,9 +134,15 @@ def test_simulated_scans_are_trained_on_and_exported(tmp_path: Path, printed: py
     assert printed.readouterr().out == ""
 
     data = write_dataset(tmp_path / "data", 3)
-    config = dataclasses.replace(CONFIG, train=dataclasses.replace(CONFIG.train, epochs=1))
-    last = train(config, data, tmp_path / "run", progress=steps)
+    train_config = dataclasses.replace(CONFIG.train, epochs=1)
+    insert = dataclasses.replace(CONFIG.augment.insert, method="gt_aug")
+    augment = dataclasses.replace(CONFIG.augment, insert=insert)
+    config = dataclasses.replace(CONFIG, train=train_config, augment=augment)
+    last = train(config, data, tmp_path / "run", progress=steps, remark=remarks.append)
     assert last.is_file() and steps.last_of("Training") == (1, 1)
+    assert steps.last_of("Object database") == steps.last_of("Measuring training scans") == (2, 2)
+    assert remarks
+    assert printed.readouterr().out == ""
 
     for number, points in enumerate(SCANS):
         write_scan(tmp_path / "scans" / f"{number}.bin", points)

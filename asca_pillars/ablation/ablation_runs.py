@@ -15,12 +15,11 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from rich.progress import track
-
 from asca_pillars.ablation.variants import Row
 from asca_pillars.base.errors import TrainingError
 from asca_pillars.base.files import write_json
 from asca_pillars.base.own_files import require_no_link, written_by
+from asca_pillars.base.progress import SILENT, Reporter
 from asca_pillars.base.system import default_threads
 
 
@@ -61,6 +60,8 @@ def finish_runs(
     jobs: int,
     overrides: Sequence[str] = (),
     init: Path | None = None,
+    *,
+    reporter: Reporter = SILENT,
 ) -> None:
     """Train and evaluate what is not yet, `jobs` processes at a time that share the cores.
 
@@ -70,6 +71,7 @@ def finish_runs(
         split: list of the data to evaluate on.
         overrides: of every run, in the form of `asca train -s`; those of the variant win over them.
         init: weights that every run starts from, see `asca train --init`.
+        reporter: for the progress.
 
     Raises:
         TrainingError: a training or an evaluation failed; the message names its log.
@@ -89,14 +91,15 @@ def finish_runs(
         where = ("--data", str(data), "--split", split, "--out", str(report))
         _run_command(run, ("eval", str(run.checkpoint), *where, "--gallery", "0", "--provider", "auto"), threads)
 
-    _run_in_threads([run for run in todo if not (run.trained.exists() and run.evaluated.exists())], finish, jobs)
+    waiting = [run for run in todo if not (run.trained.exists() and run.evaluated.exists())]
+    _run_in_threads(waiting, finish, jobs, reporter)
 
 
-def _run_in_threads(todo: Sequence[Run], work: Callable[[Run], None], jobs: int) -> None:
+def _run_in_threads(todo: Sequence[Run], work: Callable[[Run], None], jobs: int, reporter: Reporter) -> None:
     with ThreadPoolExecutor(jobs) as pool:
         waiting = [pool.submit(work, run) for run in todo]
         try:
-            for future in track(waiting, "Training and evaluating", disable=not waiting):
+            for future in reporter.track(waiting, "Training and evaluating"):
                 future.result()
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)

@@ -1,4 +1,4 @@
-"""Parallel execution of a job for many items in processes, with a progress bar."""
+"""Parallel execution of a job for many items in processes."""
 
 import contextlib
 import math
@@ -11,10 +11,8 @@ from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from typing import Any, NamedTuple, TypeVar
 
-from rich.console import Console
-from rich.progress import track
-
 from asca_pillars.base.errors import AscaError, WorkerError
+from asca_pillars.base.progress import SILENT, Reporter
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -30,8 +28,7 @@ def map_in_processes(
     title: str,
     *,
     at_once: int = 4,
-    progress: bool = True,
-    console: Console | None = None,
+    reporter: Reporter = SILENT,
 ) -> Iterator[Result]:
     """Yield the results of a job for each item, in the order of the items, each as soon as it is there.
 
@@ -39,10 +36,9 @@ def map_in_processes(
         job: one that can be sent to a process, if more than one works.
         todo: the items.
         workers: processes; with one, or with so few items that a second would get none, the job is done in this one.
-        title: of the progress bar.
+        title: name of the step for the progress.
         at_once: items that a process takes at a time.
-        progress: whether it is shown.
-        console: where; on standard output if None.
+        reporter: for the progress.
 
     Raises:
         Exception: that of the job.
@@ -55,7 +51,7 @@ def map_in_processes(
             results = _ordered_results(todo, at_once, pool)
         else:
             results = map(job, todo)
-        yield from track(results, title, total=len(todo), console=console, disable=not progress)
+        yield from reporter.track(results, title, len(todo))
 
 
 _Pool = dict[Any, BaseProcess]

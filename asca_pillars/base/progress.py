@@ -32,6 +32,11 @@ class Reporter:
         if self._remark is not None:
             self._remark(text)
 
+    def progress(self, step: str, done: int, total: int) -> None:
+        """Tell how many of the parts of a step are done."""
+        if self._progress is not None:
+            self._progress(step, done, total)
+
     def track(self, items: Iterable[Item], step: str, total: int | None = None, done: int = 0) -> Iterator[Item]:
         """Yield the items; after each one the progress callback is called.
 

@@ -66,6 +66,7 @@ def ablate(
     from asca_pillars.ablation.ablation_table import read_results, tables
     from asca_pillars.base.files import write_text
     from asca_pillars.base.own_files import page_end
+    from asca_pillars.base.progress import Reporter
     from asca_pillars.base.schema import to_dict
     from asca_pillars.base.system import default_threads
     from asca_pillars.cli.ablate_steps import (
@@ -79,10 +80,12 @@ def ablate(
         setup,
         time_variants,
     )
-    from asca_pillars.cli.prepare import prepare
+    from asca_pillars.cli.progress import Bars
     from asca_pillars.config.tree import load_config
     from asca_pillars.data.kitti import KittiSplit
+    from asca_pillars.training.prepare import prepare
 
+    console = Console(markup=False)
     overrides = override or []
     base = load_config(config, overrides)
     family = family_of(base)
@@ -93,9 +96,10 @@ def ablate(
     waiting = [load_config(config, [*overrides, *one.variant.overrides]) for one in todo if not one.trained.exists()]
     if any(one.augment.insert.method != "none" for one in waiting):
         # Checked once, not by every run.
-        prepare(Path(config), data=data, override=overrides, workers=default_threads())
-    finish_runs(todo, config, data, base.data.val_set, jobs, overrides, init)
-    console = Console(markup=False)
+        with Bars(console) as bars:
+            prepare(base, data, workers=default_threads(), reporter=Reporter(bars))
+    with Bars(console) as bars:
+        finish_runs(todo, config, data, base.data.val_set, jobs, overrides, init, reporter=Reporter(bars))
     speeds = time_variants(todo, family, KittiSplit(data, base.data.val_set), console)
     text = f"{setup(todo, config, data, base.data, jobs)}\n{tables(family, read_results(todo), speeds)}"
     path = out / RESULTS_FILE

@@ -135,8 +135,10 @@ def bench(
     from asca_pillars.base.extras import require
     from asca_pillars.base.files import write_json
     from asca_pillars.base.own_files import json_object, require_own_file
+    from asca_pillars.base.progress import Reporter
     from asca_pillars.base.writable_file import require_writable
     from asca_pillars.cli.bench_parts import Parts, measure_parts, named_bundles
+    from asca_pillars.cli.progress import Bars
     from asca_pillars.scans.find_scans import name_scans
     from asca_pillars.scans.recordings.open_recording import is_recording, open_recording
     from asca_pillars.scans.recordings.recorded_scans import RecordedScans
@@ -155,7 +157,8 @@ def bench(
         if len(scans or ()) > 1:
             raise ConfigError(f"{recordings[0]}: is a recording; give one alone")
         require("recordings")
-        recording = open_recording(recordings[0])
+        with Bars(Console(markup=False), transient=True) as bars:
+            recording = open_recording(recordings[0], Reporter(bars))
         recorded = RecordedScans(recording, recording.point_cloud_topic(topic), settings.reflectance_scale)
         mounting, notes = recorded.mounting(settings)
         points = [scan.points for scan in recorded.first(MOST_SCANS)]

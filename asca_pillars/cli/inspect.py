@@ -190,8 +190,10 @@ def _inspect_dataset(
     from asca_pillars.base.errors import ConfigError, DatasetError
     from asca_pillars.base.files import write_json
     from asca_pillars.base.own_files import json_object, require_own_file
+    from asca_pillars.base.progress import Reporter
     from asca_pillars.base.writable_file import require_writable
     from asca_pillars.cli import inspect_tables as show
+    from asca_pillars.cli.progress import Bars
     from asca_pillars.config.tree import load_config
     from asca_pillars.data.inspection.findings import findings
     from asca_pillars.data.inspection.inspect_dataset import inspect_dataset
@@ -218,14 +220,18 @@ def _inspect_dataset(
 
         settings = dataclasses.replace(settings, model=with_first_stage(settings.model))
     if propose is not None:
-        settings, text = propose_config(frames_of, settings, propose, frames)
+        with Bars(console, transient=True) as bars:
+            settings, text = propose_config(frames_of, settings, propose, frames, Reporter(bars))
         console.print(text, soft_wrap=True)
         next_step = f"asca train {propose} --data {frames_of.root} --out runs/own"
         console.print(f"Written to {propose}. Next: {next_step}", soft_wrap=True)
     spec, min_points = settings.model.spec, settings.data.min_points
     view = settings.data.camera_view and frames_of.has_camera
     assigner = settings.model.loss.assigner if settings.model.kind == "pillar" else "overlap"
-    inspection = inspect_dataset(frames_of, spec, settings.data, assigner=assigner, frames=frames, progress=True)
+    with Bars(console, transient=True) as bars:
+        inspection = inspect_dataset(
+            frames_of, spec, settings.data, assigner=assigner, frames=frames, reporter=Reporter(bars)
+        )
     found = findings(inspection, spec, min_points)
     if json is not None:
         report = {"config": settings.name} | dataclasses.asdict(inspection)

@@ -32,10 +32,10 @@ def prepare(
     first. Training does the same on first use; what is there and unchanged is used again. Without an insertion method
     in the config, what RS-Aug needs is prepared.
     """
-    from dataclasses import replace
-
     from rich.console import Console
 
+    from asca_pillars.base.progress import Reporter
+    from asca_pillars.cli.progress import Bars
     from asca_pillars.config.tree import load_config
 
     settings = load_config(config, override or ())
@@ -46,25 +46,14 @@ def prepare(
         for path in write_train_val_lists(data):
             console.print(f"written: {path}", soft_wrap=True, highlight=False)
     require("train")
-    from asca_pillars.data.insertion.free_space import prepare_free_spaces
-    from asca_pillars.data.insertion.insert_objects import prepare_inserter
-    from asca_pillars.data.open_split import open_split
+    from asca_pillars.training.prepare import prepare as run
 
-    if settings.model.kind == "pillar_refine":
-        from asca_pillars.models.build import build_preparation
-
-        for name in (settings.data.train_set, settings.data.val_set):
-            build_preparation(settings.model, open_split(data, name), replace(settings.data, workers=workers))
+    with Bars(console) as bars:
+        inserter = run(settings, data, workers=workers, reporter=Reporter(bars))
+    if inserter is None:
         return
-    # A config without a chosen method gets the caches of both.
-    insert = settings.augment.insert
-    insert = insert if insert.method != "none" else replace(insert, method="rs_aug")
-    spec = settings.model.spec
-    split = open_split(data, settings.data.train_set)
-    inserter = prepare_inserter(split, spec, replace(settings.data, workers=workers), insert)
-    if insert.method == "rs_aug":
-        prepare_free_spaces(split, inserter.prepared, camera_view=inserter.camera_view, workers=workers)
-    lines = [f"{inserter.database.path}: {len(inserter.database)} objects of {len(split.frame_ids)} frames"]
-    for name, objects, share in zip(spec.class_names, inserter.candidates, inserter.shares, strict=True):
-        lines.append(f"  {name}: {len(objects)} with {insert.min_points} or more points, drawn {share:.0%} of the time")
+    database, least = inserter.database, inserter.settings.min_points
+    lines = [f"{database.path}: {len(database)} objects of {len(inserter.split.frame_ids)} frames"]
+    for name, objects, share in zip(settings.model.spec.class_names, inserter.candidates, inserter.shares, strict=True):
+        lines.append(f"  {name}: {len(objects)} with {least} or more points, drawn {share:.0%} of the time")
     console.print("\n".join(lines), soft_wrap=True, highlight=False)

@@ -176,6 +176,7 @@ def simulate(
                 val_share=val_share,
                 cluster=cluster,
                 progress=bars,
+                remark=bars.remark,
             )
         if sequences is None:
             console.print(f"{done.frames} frames below {out}; look at one: asca detect {done.scans}/000000.bin")

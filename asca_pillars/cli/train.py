@@ -1,7 +1,7 @@
 """`asca train`: training by a YAML on a dataset, into a run's folder."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -46,6 +46,7 @@ def train(
     from rich.console import Console
 
     from asca_deploy.shipped import find_checkpoint
+    from asca_pillars.cli.progress import Bars
     from asca_pillars.config.tree import load_config
     from asca_pillars.training.run_files import require_own_run
 
@@ -55,10 +56,14 @@ def train(
     console = Console(markup=False)
     init = None if init is None else find_checkpoint(init)
     with console.status("Loading PyTorch"):
+        from asca_pillars.cli.run_progress import RunProgress
         from asca_pillars.training.callbacks import TrainingInterruptedError
         from asca_pillars.training.train import train as run_training
+    options: dict[str, Any] = {"devices": devices, "num_nodes": num_nodes, "init": init}
     try:
-        last = run_training(settings, data, out, devices=devices, num_nodes=num_nodes, init=init, bar=True)
+        with Bars(console, transient=True) as bars:
+            run = RunProgress(console)
+            last = run_training(settings, data, out, **options, progress=bars, remark=bars.remark, bar=run)
     except TrainingInterruptedError as stop:
         console.print(str(stop))
         raise typer.Exit(INTERRUPTED) from None

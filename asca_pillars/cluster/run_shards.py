@@ -5,11 +5,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
 from asca_pillars.base.errors import ClusterError
 from asca_pillars.base.locks import recover
+from asca_pillars.base.progress import Reporter
 from asca_pillars.cluster.ray_pool import RayPool, connected
 from asca_pillars.cluster.shards import Outcome, Result, Shard, make_shards, process_shards
 
@@ -22,10 +20,10 @@ def run_shards(
     seen: Path,
     folders: Sequence[Path],
     title: str,
+    reporter: Reporter,
     done: int = 0,
     cpus: int = 1,
     gpus: int = 0,
-    progress: bool = True,
 ) -> Iterator[Outcome[Result]]:
     """Do a job for each shard on a cluster; yields each one as it ends, as `process_shards`.
 
@@ -34,31 +32,30 @@ def run_shards(
         shards: shards to do.
         address: address of the cluster; `local` for this machine alone.
         folders: folders that the job writes into. Leftovers of killed workers are removed before and after the run.
-        title: title of the progress bar, which counts items.
+        title: name of the step for the progress, which counts items.
+        reporter: for the progress, and told which cluster it is and of a machine that is missing.
         done: number of items that an earlier run has done.
-        progress: whether to show the bar.
 
     Raises:
         ClusterError: the cluster cannot be used.
         Exception: that of the job.
     """
-    console = Console(markup=False)
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     for folder in folders:
         recover(folder)
     try:
-        with connected(address) as cluster, Progress(*columns, console=console, disable=not progress) as bar:
-            console.print(cluster, highlight=False)
+        with connected(address) as cluster:
+            reporter.remark(cluster)
             total = done + sum(len(shard.items) for shard in shards)
-            task = bar.add_task(title, total=total, completed=done)
+            reporter.progress(title, done, total)
             pool = RayPool(job, seen, cpus=cpus, gpus=gpus)
             if not pool.fits():
                 needed = f"{cpus} CPU{'s'[: cpus > 1]}" + (" and a GPU" if gpus else "")
-                console.print(
+                reporter.remark(
                     f"no machine of the cluster has {needed}, which each worker takes: waiting for one to join"
                 )
             for outcome in process_shards(shards, pool):
-                bar.advance(task, len(outcome.shard.items))
+                done += len(outcome.shard.items)
+                reporter.progress(title, done, total)
                 yield outcome
     finally:
         for folder in folders:
@@ -74,7 +71,7 @@ def run_items(
     seen: Path,
     folders: Sequence[Path],
     title: str,
-    progress: bool = True,
+    reporter: Reporter,
 ) -> None:
     """Do a job that returns nothing for each item on a cluster, `shard_size` of them by one worker.
 
@@ -90,7 +87,7 @@ def run_items(
     lost: list[Any] = []
     shards = make_shards(items, shard_size)
     for outcome in run_shards(
-        partial(_run_shard, job), shards, address, seen=seen, folders=folders, title=title, progress=progress
+        partial(_run_shard, job), shards, address, seen=seen, folders=folders, title=title, reporter=reporter
     ):
         lost += outcome.shard.items if outcome.died else ()
     if lost:

@@ -5,9 +5,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.progress import track
 
 from asca_pillars.base.errors import DatasetError
+from asca_pillars.base.progress import SILENT, Reporter
 from asca_pillars.config.tree import Config
 from asca_pillars.data.frames import other_spelling, read_frame, within_ranges
 from asca_pillars.data.labeled_split import LabeledSplit
@@ -32,7 +32,7 @@ class _Labels:
     one_with_points: bool = False
 
 
-def require_boxes(split: LabeledSplit, config: Config, *, training: bool, bar: bool = True) -> list[str]:
+def require_boxes(split: LabeledSplit, config: Config, *, training: bool, reporter: Reporter = SILENT) -> list[str]:
     """Make sure that a list has boxes of the classes to be learnt; returns a line for each other problem.
 
     These are a class without a box, and yaws that look like degrees. Frames are read until every class is found.
@@ -42,7 +42,7 @@ def require_boxes(split: LabeledSplit, config: Config, *, training: bool, bar: b
         config: classes, ranges, and the points that a box needs.
         training: whether a list without any box is refused. A validation list is refused only if its labels spell
             the classes in another way.
-        bar: show a progress bar on the terminal.
+        reporter: for the progress.
 
     Raises:
         DatasetError: there is no box of any class that could be learnt; a file is missing or cannot be read.
@@ -51,10 +51,12 @@ def require_boxes(split: LabeledSplit, config: Config, *, training: bool, bar: b
     names = config.model.spec.class_names
     labels = _Labels()
     order = np.random.default_rng(0).permutation(len(split.frame_ids)).tolist()
-    for number in track(order, "Looking for boxes of each class", transient=True, disable=not bar):
+    step = "Looking for boxes of each class"
+    for number in reporter.track(order, step):
         _add(labels, split, split.frame_ids[number], config)
         complete = labels.one_with_points and all(labels.in_ranges[name] for name in names)
         if complete and len(labels.yaws) >= FEWEST_FRAMES:
+            reporter.progress(step, len(order), len(order))
             break
     missing = [name for name in names if not labels.in_ranges[name]]
     place = f"{split.root}: list `{split.name}`"

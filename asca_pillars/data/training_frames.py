@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from asca_pillars.base.progress import SILENT, Reporter
 from asca_pillars.config.tree import AugmentConfig, Config
 from asca_pillars.data.augment import augment
 from asca_pillars.data.frames import LabeledFrame, read_frame
@@ -67,7 +68,7 @@ class TrainingFrames:
         return frame, rng
 
 
-def open_frames(root: str | Path, config: Config, *, training: bool) -> TrainingFrames:
+def open_frames(root: str | Path, config: Config, *, training: bool, reporter: Reporter = SILENT) -> TrainingFrames:
     """Open the training or validation frames of `config`; the object database is built if it is missing.
 
     Raises:
@@ -75,12 +76,13 @@ def open_frames(root: str | Path, config: Config, *, training: bool) -> Training
     """
     data, spec, insert = config.data, config.model.spec, config.augment.insert
     split = open_split(root, data.train_set if training else data.val_set)
+    inserts = training and insert.method != "none"
     return TrainingFrames(
         split,
         spec,
         camera_view=data.camera_view and split.has_camera,
         min_points=data.min_points,
         augmentation=config.augment if training else None,
-        inserter=prepare_inserter(split, spec, data, insert) if training and insert.method != "none" else None,
+        inserter=prepare_inserter(split, spec, data, insert, reporter) if inserts else None,
         seed=config.train.seed,
     )

@@ -2,6 +2,7 @@
 
 from typing import assert_never
 
+from asca_pillars.base.progress import SILENT, Reporter
 from asca_pillars.config.pillar import PillarModel
 from asca_pillars.config.pv_rcnn import PvRcnnModel
 from asca_pillars.config.tree import DataConfig, ModelConfig
@@ -33,7 +34,9 @@ def build_model(model: ModelConfig) -> Trainable:
             assert_never(model)
 
 
-def build_preparation(model: ModelConfig, split: LabeledSplit, data: DataConfig) -> Preparation:
+def build_preparation(
+    model: ModelConfig, split: LabeledSplit, data: DataConfig, reporter: Reporter = SILENT
+) -> Preparation:
     """Return the `Preparation` of batches for the network; what is computed once per dataset is computed here.
 
     Raises:
@@ -45,7 +48,7 @@ def build_preparation(model: ModelConfig, split: LabeledSplit, data: DataConfig)
             rule = network.active_cells if network.neck == "sparse" else None
             return PillarPreparation(model.spec, rule, model.loss.assigner)
         case RefineModel():
-            return cached_preparation(model, split, data)
+            return cached_preparation(model, split, data, reporter)
         case PvRcnnModel():
             return VoxelPreparation(model.spec, model.settings)
         case _:

@@ -10,7 +10,7 @@ from asca_pillars.base.errors import ConfigError, DatasetError
 from asca_pillars.base.files import write_text
 from asca_pillars.base.own_files import json_object, require_no_link, require_own, require_own_file
 from asca_pillars.base.processes import map_in_processes
-from asca_pillars.base.progress import Progress, Reporter
+from asca_pillars.base.progress import Reporter
 from asca_pillars.data.kitti.kitti_split import SIMULATION_FILE
 
 COMMAND = "asca simulate"
@@ -32,10 +32,9 @@ def held_out(count: int, share: float) -> int:
     return min(max(rounded, 1), count - 1) if 0 < share < 1 and count > 1 else rounded
 
 
-def for_each(job: Callable[[Item], None], todo: Sequence[Item], workers: int, *, progress: Progress | None) -> None:
+def for_each(job: Callable[[Item], None], todo: Sequence[Item], workers: int, reporter: Reporter) -> None:
     """Do a job for each item, in `workers` processes; the job must be picklable."""
-    done = map_in_processes(job, todo, workers, "Simulating", progress=False)
-    for _ in Reporter(progress).track(done, "Simulating", len(todo)):
+    for _ in map_in_processes(job, todo, workers, "Simulating", reporter=reporter):
         pass
 
 

@@ -6,7 +6,7 @@ from typing import Literal
 
 from asca_pillars.base.errors import ConfigError
 from asca_pillars.base.extras import require
-from asca_pillars.base.progress import Progress
+from asca_pillars.base.progress import Progress, Remark, Reporter
 
 FRAMES, LENGTH = 100, 100
 
@@ -39,6 +39,7 @@ def simulate(
     val_share: float = 0.1,
     cluster: str | None = None,
     progress: Progress | None = None,
+    remark: Remark | None = None,
 ) -> Simulated:
     """Write labelled scans of simulated streets in KITTI's layout, or short drives as a dataset of boxes.
 
@@ -53,7 +54,8 @@ def simulate(
         view: "full", "camera" or "around", see `SimulationConfig`; None: that of the config.
         val_share: share of the frames in ImageSets/val.txt.
         cluster: address of a Ray cluster that does the work.
-        progress: called after each scan; a cluster shows a bar of its own if it is given.
+        progress: called after each scan.
+        remark: called with what a cluster has to say.
 
     Raises:
         AscaError: an argument cannot be used, or `out` holds something else.
@@ -70,12 +72,13 @@ def simulate(
 
     out = Path(out)
     settings = load_simulation_config(config, view)
+    reporter = Reporter(progress, remark)
     if sequences is not None:
         require_own_sequences(out)
         length = length or LENGTH
-        simulate_sequences(out, sequences, length, seed, workers, settings, val_share=val_share, progress=progress)
+        simulate_sequences(out, sequences, length, seed, workers, settings, val_share=val_share, reporter=reporter)
         return Simulated(out, out / "scans", sequences * length)
     frames = frames or FRAMES
     require_own_frames(out)
-    write_frames(out, frames, seed, workers, settings, val_share, progress, cluster=cluster)
+    write_frames(out, frames, seed, workers, settings, val_share, reporter, cluster=cluster)
     return Simulated(out, out / "training" / "velodyne", frames)

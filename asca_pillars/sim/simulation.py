@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-from asca_pillars.base.progress import Progress
+from asca_pillars.base.progress import Reporter
 from asca_pillars.base.schema import parse
 from asca_pillars.base.settings import read_settings, shipped_configs
 from asca_pillars.base.strict import Strict
@@ -159,7 +159,7 @@ def simulate(
     workers: int = 1,
     config: SimulationConfig | None = None,
     val_share: float = 0.1,
-    progress: Progress | None = None,
+    reporter: Reporter | None = None,
     *,
     cluster: str | None = None,
 ) -> Path:
@@ -177,7 +177,7 @@ def simulate(
         workers: processes, without a cluster.
         config: settings of the simulation.
         val_share: 0..1.
-        progress: called after each frame; a cluster shows a bar of its own if it is given.
+        reporter: for the progress, and told which cluster it is; None for none.
         cluster: address of a Ray cluster that does the work, `local` for one on this machine; None: processes.
 
     Raises:
@@ -186,7 +186,7 @@ def simulate(
         DatasetError: `out` holds frames of another seed or configuration.
     """
     check_counts({"frames": frames, "workers": workers}, val_share)
-    root = Path(out)
+    root, reporter = Path(out), reporter or Reporter()
     config = config or SimulationConfig()
     split = KittiSplit(root)
     record_settings(root, {"seed": seed, **asdict(config)}, split.folder / "velodyne")
@@ -201,10 +201,10 @@ def simulate(
             seen=root / SIMULATION_FILE,
             folders=[split.folder / name for name in ("velodyne", "label_2", "calib")],
             title="Simulating",
-            progress=progress is not None,
+            reporter=reporter,
         )
     else:
-        for_each(job, todo, workers, progress=progress)
+        for_each(job, todo, workers, reporter)
     names = [frame_id(index) for index in range(frames)]
     first_val = frames - held_out(frames, val_share)
     write_image_set(root, "train", names[:first_val])

@@ -8,12 +8,10 @@ from typing import Any
 
 import lightning as L  # noqa: N812  (Lightning's own convention)
 from lightning.pytorch.callbacks import Checkpoint, ProgressBar, WeightAveraging
-from rich import progress as bars
-from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from torch import Tensor
 
 from asca_pillars.base.errors import TrainingError
-from asca_pillars.base.progress import Progress, Remark
+from asca_pillars.base.progress import Reporter
 from asca_pillars.training.checkpoints import LastCheckpoint
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)  # Ctrl-C; what `kill`, systemd and batch systems send
@@ -112,86 +110,17 @@ class RankProgress(ProgressBar):
         self._enabled = True
 
 
-class RunProgress(RankProgress):
-    """One bar over all steps of the run, so that the time that is left is that of the run."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self._bar = bars.Progress(
-            TextColumn("{task.description}"),
-            BarColumn(),
-            MofNCompleteColumn(),
-            TimeElapsedColumn(),
-            TextColumn("left"),
-            TimeRemainingColumn(elapsed_when_finished=True, compact=True),
-            TextColumn("{task.fields[loss]}"),
-            speed_estimate_period=600,
-        )
-        self._task = self._bar.add_task("Starting", total=None, loss="")
-
-    def on_sanity_check_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Show that something happens from the first loader process on."""
-        self._start("Checking validation")
-
-    def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Set the length of the run."""
-        total = (trainer.max_epochs or 0) * pl_module.steps_per_epoch()  # type: ignore[operator]
-        self._start("Starting")
-        self._bar.update(self._task, total=total, completed=trainer.global_step)
-
-    def on_train_epoch_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Show the epoch, counted from one."""
-        self._bar.update(self._task, description=f"Epoch {trainer.current_epoch + 1}/{trainer.max_epochs}")
-
-    def on_train_batch_end(self, trainer: L.Trainer, pl_module: L.LightningModule, *_: Any) -> None:
-        """Advance by one step."""
-        loss = trainer.progress_bar_metrics.get("loss")
-        self._bar.update(
-            self._task, completed=trainer.global_step, loss="" if loss is None else f"loss {float(loss):.3f}"
-        )
-
-    def on_validation_batch_end(self, trainer: L.Trainer, pl_module: L.LightningModule, *arguments: Any) -> None:
-        """Show the progress of the validation beside the epoch."""
-        if not trainer.sanity_checking:
-            batches = sum(int(count) for count in trainer.num_val_batches)
-            done = f"validation {arguments[2] + 1}/{batches}"
-            self._bar.update(self._task, description=f"Epoch {trainer.current_epoch + 1}/{trainer.max_epochs}, {done}")
-
-    def teardown(self, trainer: L.Trainer, pl_module: L.LightningModule, stage: str) -> None:
-        """Leave the bar as it is."""
-        self._bar.stop()
-
-    def on_exception(self, trainer: L.Trainer, pl_module: L.LightningModule, exception: BaseException) -> None:
-        """Leave the bar as it is, or it would be drawn over the error."""
-        self._bar.stop()
-
-    def print(self, *args: Any, **_: Any) -> None:
-        """Print a line above the bar."""
-        if self._enabled:
-            self._bar.console.print(" ".join(map(str, args)), markup=False, highlight=False, soft_wrap=True)
-
-    def _start(self, what: str) -> None:
-        if self._enabled:
-            self._bar.update(self._task, description=what)
-            self._bar.start()
-
-
 class StepProgress(RankProgress):
-    """Calls `progress` after each step of the run, and draws nothing.
+    """Tells a reporter of each step of the run and the line of each validation, and draws nothing."""
 
-    Args:
-        progress: None for none.
-        remark: called with the line of each validation.
-    """
-
-    def __init__(self, progress: Progress | None, remark: Remark) -> None:
+    def __init__(self, reporter: Reporter) -> None:
         super().__init__()
-        self._progress, self._remark, self._total = progress, remark, 0
+        self._reporter, self._total = reporter, 0
 
     def print(self, *args: Any, **_: Any) -> None:
-        """Pass a line to `remark`."""
+        """Pass a line on as a remark."""
         if self._enabled:
-            self._remark(" ".join(map(str, args)))
+            self._reporter.remark(" ".join(map(str, args)))
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Set the length of the run."""
@@ -203,8 +132,8 @@ class StepProgress(RankProgress):
         self._report_step(trainer)
 
     def _report_step(self, trainer: L.Trainer) -> None:
-        if self._progress is not None and self._enabled:
-            self._progress("Training", trainer.global_step, self._total)
+        if self._enabled:
+            self._reporter.progress("Training", trainer.global_step, self._total)
 
 
 def weight_average(decay: float) -> WeightAveraging:

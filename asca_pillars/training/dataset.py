@@ -9,6 +9,7 @@ import numpy as np
 from torch.utils.data import Dataset
 
 from asca_pillars.base.errors import AscaError, WorkerError
+from asca_pillars.base.progress import SILENT, Reporter
 from asca_pillars.config.tree import Config
 from asca_pillars.data.frames import LabeledFrame, within_ranges
 from asca_pillars.data.training_frames import TrainingFrames, open_frames
@@ -108,11 +109,11 @@ class LabeledDataset(Dataset[Sample | AscaError]):
         return Sample(within_ranges(frame, self.frames.spec.ranges), self.preparation.prepare(frame, rng))
 
 
-def open_dataset(root: str | Path, config: Config, *, training: bool) -> LabeledDataset:
+def open_dataset(root: str | Path, config: Config, *, training: bool, reporter: Reporter = SILENT) -> LabeledDataset:
     """Open the training or the validation samples of `config`.
 
     Raises:
         DatasetError: as `open_frames`.
     """
-    frames = open_frames(root, config, training=training)
-    return LabeledDataset(frames, build_preparation(config.model, frames.split, config.data))
+    frames = open_frames(root, config, training=training, reporter=reporter)
+    return LabeledDataset(frames, build_preparation(config.model, frames.split, config.data, reporter))

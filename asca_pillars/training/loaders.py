@@ -14,6 +14,7 @@ import numpy as np
 from torch.utils.data import DataLoader, Sampler
 
 from asca_pillars.base.errors import TrainingError, WorkerError
+from asca_pillars.base.progress import SILENT, Reporter
 from asca_pillars.config.tree import Config
 from asca_pillars.training.dataset import Collate, LabeledDataset, open_dataset
 from asca_pillars.training.shared_batches import ShareCollated, loader_context, start_loader_process
@@ -89,11 +90,11 @@ def _kill(loader: BatchLoader) -> None:
 class DetectionData(L.LightningDataModule):
     """Training and validation frames of one dataset."""
 
-    def __init__(self, config: Config, root: str | Path) -> None:
+    def __init__(self, config: Config, root: str | Path, reporter: Reporter = SILENT) -> None:
         super().__init__()
         self.batch_size, self.seed, self.workers = config.train.batch_size, config.train.seed, config.data.workers
-        self.training_set = open_dataset(root, config, training=True)
-        self.validation_set = open_dataset(root, config, training=False)
+        self.training_set = open_dataset(root, config, training=True, reporter=reporter)
+        self.validation_set = open_dataset(root, config, training=False, reporter=reporter)
         for frames in (self.training_set.frames, self.validation_set.frames):
             frames.split.require_files()
 

@@ -14,12 +14,11 @@ from lightning.fabric.utilities.rank_zero import rank_zero_only
 from lightning.fabric.utilities.warnings import PossibleUserWarning
 from lightning.pytorch.callbacks import Callback, LearningRateMonitor, ProgressBar
 from lightning.pytorch.loggers import TensorBoardLogger
-from rich.console import Console
 
 from asca_pillars.base.errors import TrainingError
 from asca_pillars.base.files import WEIGHTS_FILE
 from asca_pillars.base.locks import only_writer, recover
-from asca_pillars.base.progress import Remark
+from asca_pillars.base.progress import Reporter
 from asca_pillars.config.pillar import PillarModel
 from asca_pillars.config.tree import Config, ModelConfig, TrainConfig
 from asca_pillars.config.two_stage import RefineModel
@@ -28,7 +27,7 @@ from asca_pillars.data.require_boxes import require_boxes
 from asca_pillars.models.checkpoint_file import save_weights
 from asca_pillars.models.pillar.distillation import Distillation
 from asca_pillars.models.two_stage.first_stage import with_first_stage
-from asca_pillars.training.callbacks import RunProgress, SaveOnInterrupt, weight_average
+from asca_pillars.training.callbacks import SaveOnInterrupt, StepProgress, weight_average
 from asca_pillars.training.checkpoints import (
     LAST,
     AtomicCheckpointIO,
@@ -55,7 +54,7 @@ def train(
     num_nodes: int = 1,
     init: Path | None = None,
     bar: ProgressBar | None = None,
-    remark: Remark | None = None,
+    reporter: Reporter | None = None,
 ) -> Path:
     """Train `config` on a dataset, or go on where an interrupted run in `out` stopped.
 
@@ -73,8 +72,8 @@ def train(
         num_nodes: machines that train together, each started with the same command (torchrun, SLURM).
         init: checkpoint that a new run starts from, see `initial_weights`; a run that goes on must have started from
             them.
-        bar: displays or reports the progress; None: on the terminal.
-        remark: called with what is odd about the run; None: it is printed.
+        bar: shows the steps and validations of the run; None: the reporter is told of them.
+        reporter: told of what comes before, and of what is odd about the run; None for none.
 
     Returns:
         The last checkpoint.
@@ -90,7 +89,7 @@ def train(
     """
     # The processes of one run share its folder: the first holds it.
     with only_writer(out, COMMAND) if getattr(rank_zero_only, "rank", 0) == 0 else nullcontext():
-        return _train(config, data_root, Path(out), devices, num_nodes, init, bar=bar or RunProgress(), remark=remark)
+        return _train(config, data_root, Path(out), devices, num_nodes, init, bar=bar, reporter=reporter or Reporter())
 
 
 def _train(
@@ -101,8 +100,8 @@ def _train(
     num_nodes: int,
     init: Path | None,
     *,
-    bar: ProgressBar,
-    remark: Remark | None,
+    bar: ProgressBar | None,
+    reporter: Reporter,
 ) -> Path:
     if isinstance(config.model, RefineModel):
         config = replace(config, model=with_first_stage(config.model))
@@ -121,25 +120,26 @@ def _train(
     files = AtomicCheckpointIO(keep_last=damage is None)
     last = LastCheckpoint(checkpoints, config.train.checkpoint_steps)
     interrupt = SaveOnInterrupt(last)
-    callbacks = [bar, last, interrupt]
+    callbacks = [StepProgress(reporter) if bar is None else bar, last, interrupt]
     trainer = _trainer(config, out, files, callbacks, int(devices) if devices.isdigit() else devices, num_nodes)
-    say = rank_zero_only(remark or _print)
+    if not trainer.is_global_zero:
+        reporter = Reporter()  # one process speaks for all
     for name, training in ((config.data.train_set, True), (config.data.val_set, False)):
         split = open_split(data_root, name)
         split.require_files()
-        for warning in require_boxes(split, config, training=training, bar=remark is None):
-            say(warning)
-    data = DetectionData(config, data_root)
+        for warning in require_boxes(split, config, training=training, reporter=reporter):
+            reporter.remark(warning)
+    data = DetectionData(config, data_root, reporter)
     inputs = TrainingInputs.of(data.training_set.frames.split, trainer.world_size, weights)
     claim_run_folder(out, config, inputs, steps_of(resumed))
     if damage is not None and goes_on:
-        say(f"{damage}: going on from {resumed}")
+        reporter.remark(f"{damage}: going on from {resumed}")
     if config.train.precision == "bf16" and not has_bfloat16():
         remedy = f"go on where {out} was started, or anew with --init" if goes_on else "choose auto or fp32"
-        say(f"train.precision = bf16: this device has no bfloat16 and is many times slower in it; {remedy}")
+        reporter.remark(f"train.precision = bf16: this device has no bfloat16 and is many times slower in it; {remedy}")
     L.seed_everything(config.train.seed, verbose=False)
     keep = goes_on or not trainer.is_global_zero  # else it may be of scans that were there before
-    measured = measure_input(out, data.training_set.frames, keep=keep, bar=remark is None)
+    measured = measure_input(out, data.training_set.frames, keep=keep, reporter=reporter)
     module = DetectionModule(config, measured, distillation)
     if weights and not goes_on:
         module.detector.load_state_dict(module.detector.state_dict() | weights)
@@ -159,10 +159,6 @@ def _train(
             if trainer.is_global_zero and (checkpoints / LAST).is_file():
                 save_weights(checkpoints / LAST, checkpoints / WEIGHTS_FILE)
     return checkpoints / LAST
-
-
-def _print(text: str) -> None:
-    Console(markup=False, highlight=False).print(text, style="yellow", soft_wrap=True)
 
 
 def syncs_statistics(model: ModelConfig) -> bool:

@@ -6,12 +6,12 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import yaml
-from rich.progress import track
 from torch import Tensor
 
 from asca_pillars.base.errors import TrainingError
 from asca_pillars.base.files import write_json, write_text
 from asca_pillars.base.own_files import require_own_file
+from asca_pillars.base.progress import SILENT, Reporter
 from asca_pillars.base.schema import to_dict
 from asca_pillars.base.settings import read_settings
 from asca_pillars.base.system import describe_environment
@@ -104,10 +104,8 @@ def recorded_precision(out: Path) -> Precision:
     return load_config(path).train.precision if path.exists() else "auto"
 
 
-def measure_input(out: Path, frames: TrainingFrames, *, keep: bool, bar: bool = True) -> ExpectedInput:
+def measure_input(out: Path, frames: TrainingFrames, *, keep: bool, reporter: Reporter = SILENT) -> ExpectedInput:
     """Measure up to EXPECTED_INPUT_FRAMES evenly spaced training scans; with `keep`, a measurement in `out` is read.
-
-    `bar` shows a progress bar on the terminal.
 
     Raises:
         DatasetError, ScanError: a frame cannot be read.
@@ -120,7 +118,7 @@ def measure_input(out: Path, frames: TrainingFrames, *, keep: bool, bar: bool = 
     ids = frames.frame_ids
     count = min(len(ids), EXPECTED_INPUT_FRAMES)
     spaced = [ids[i * len(ids) // count] for i in range(count)]
-    chosen = track(spaced, "Measuring training scans", transient=True, disable=not bar)
+    chosen = reporter.track(spaced, "Measuring training scans")
     scans = (read_frame(frames.split, one, (), camera_view=frames.camera_view).points for one in chosen)
     try:
         measured = measure_expected_input(scans, frames.camera_view)

@@ -2,10 +2,14 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from asca_pillars.base.extras import require
-from asca_pillars.base.progress import Progress, Remark
+from asca_pillars.base.progress import Progress, Remark, Reporter
 from asca_pillars.config.tree import Config, load_config
+
+if TYPE_CHECKING:
+    from lightning.pytorch.callbacks import ProgressBar
 
 
 def train(
@@ -17,9 +21,9 @@ def train(
     devices: str = "auto",
     num_nodes: int = 1,
     init: str | Path | None = None,
-    bar: bool = False,
     progress: Progress | None = None,
     remark: Remark | None = None,
+    bar: "ProgressBar | None" = None,
 ) -> Path:
     """Train a detector, or go on where an interrupted run in `out` stopped.
 
@@ -31,9 +35,9 @@ def train(
         devices: number of devices on this machine, or `auto`.
         num_nodes: machines that train together.
         init: checkpoint that a new run starts from.
-        bar: draw a bar on the terminal and print remarks there, as `asca train` does.
-        progress: called after each step, without `bar`.
-        remark: called with the line of each validation and what is odd about the run, without `bar`.
+        progress: called after each step, and before with what is prepared for the run.
+        remark: called with the line of each validation, and what is odd about the run.
+        bar: shows the steps and validations of the run in place of `progress` and `remark`.
 
     Returns:
         The last checkpoint.
@@ -47,9 +51,7 @@ def train(
 
     init = None if init is None else Path(init)
     require_own_run(Path(out), init)
-    from asca_pillars.training.callbacks import RunProgress, StepProgress
     from asca_pillars.training.loop import train as run
 
-    remark_line = None if bar else remark or (lambda _: None)
-    reporter = RunProgress() if remark_line is None else StepProgress(progress, remark_line)
-    return run(settings, data, out, devices=devices, num_nodes=num_nodes, init=init, bar=reporter, remark=remark_line)
+    reporter = Reporter(progress, remark)
+    return run(settings, data, out, devices=devices, num_nodes=num_nodes, init=init, bar=bar, reporter=reporter)

@@ -160,8 +160,8 @@ def detect_archive(
         reading: how the files are read and the sensor was mounted.
         score: report detections from this score on, or by class; None: the thresholds of the model.
         around: detect in every direction, see `asca_deploy.around`; None: if the first scan lies all around the sensor.
-        progress: called while it is found out what an earlier run has done.
-        remark: called with what was decided for a folder.
+        progress: called while it is found out what an earlier run has done, and after each shard.
+        remark: called with what was decided for a folder, and which cluster it is.
 
     Raises:
         AscaError: an option cannot be used, the cluster not be reached, or no scan can be read.
@@ -185,7 +185,7 @@ def detect_archive(
     there = folder.done(reporter.track(shards, "Checking what is done"))
     todo = [shard for shard in shards if shard.name not in there]
     done = len(scans) - sum(len(shard.items) for shard in todo)
-    repeats = _process(job, folder, todo, done, address)
+    repeats = _process(job, folder, todo, done, address, reporter)
     counts = merge(folder.lines(shards), out)
     if not counts.detected:
         raise ScanError(f"none of the {len(scans)} scans can be read; the reasons are in {out / UNREADABLE_FILE}")
@@ -212,7 +212,9 @@ def merge(lines: Iterable[str], out: Path) -> ArchiveCounts:
     return ArchiveCounts(detected, unreadable)
 
 
-def _process(job: DetectShard, folder: ShardFolder, todo: Sequence[Shard], done: int, address: str) -> int:
+def _process(
+    job: DetectShard, folder: ShardFolder, todo: Sequence[Shard], done: int, address: str, reporter: Reporter
+) -> int:
     """Process the shards; return how often one was restarted."""
     if not todo:
         return 0
@@ -229,6 +231,7 @@ def _process(job: DetectShard, folder: ShardFolder, todo: Sequence[Shard], done:
         done=done,
         cpus=job.options.threads or 1,
         gpus=int(job.options.provider in ("cuda", "tensorrt")),
+        reporter=reporter,
     )
     for outcome in outcomes:
         repeats += outcome.repeats

@@ -136,7 +136,11 @@ def inspect_scans(
     ranges, expected = model.spec.ranges, model.expected_input
     if around:
         ranges = ranges_around(ranges, len(turns_around(ranges, camera_view=expected.camera_view)))
-    source = _open_recording(path, topic, reading, frames) if is_recording(path) else _open_files(path, reading, frames)
+    reporter = Reporter(progress)
+    if is_recording(path):
+        source = _open_recording(path, topic, reading, frames, reporter)
+    else:
+        source = _open_files(path, reading, frames)
     if topic is not None and source.recorded is None:
         raise ConfigError(f"--topic {topic}: is for recordings (.mcap, .db3, .bag, .pcap); leave it out")
     mounting, height, doubt = _mounting(reading, source.samples)
@@ -145,7 +149,7 @@ def inspect_scans(
     frame_ids: dict[str, None] = {}
     fields: tuple[str, ...] = ()
     error_texts: list[str] = []
-    for one in Reporter(progress).track(source.scans, "Inspecting", source.to_read):
+    for one in reporter.track(source.scans, "Inspecting", source.to_read):
         if one.scan is None:
             error_texts.append(str(one.error_text))
             continue
@@ -211,11 +215,11 @@ class _Source(NamedTuple):
     recorded: RecordedScans | None = None
 
 
-def _open_recording(path: Path, topic: str | None, reading: ScanSettings, frames: int) -> _Source:
+def _open_recording(path: Path, topic: str | None, reading: ScanSettings, frames: int, reporter: Reporter) -> _Source:
     if reading.columns is not None:
         raise ConfigError(f"--columns {reading.columns}: is for .bin files, and a recording names its fields")
     require("recordings")
-    recording = open_recording(path)
+    recording = open_recording(path, reporter)
     scans = RecordedScans(recording, recording.point_cloud_topic(topic), reading.reflectance_scale)
     total, notes = scans.topic.messages, scale_notes(scans.scale)
     step = max(math.ceil(total / frames), 1)

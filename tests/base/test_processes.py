@@ -27,7 +27,7 @@ def square(number: int) -> tuple[int, int, int]:
 
 
 def squares(count: int, workers: int, at_once: int = 4) -> Iterator[tuple[int, int, int]]:
-    return map_in_processes(square, range(count), workers, "Squares", at_once=at_once, progress=False)
+    return map_in_processes(square, range(count), workers, "Squares", at_once=at_once)
 
 
 def test_results_come_in_order_from_processes_of_one_thread(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -55,12 +55,12 @@ class TwoArgumentsError(Exception):
 
 @pytest.mark.parametrize("workers", [1, 2])
 def test_the_error_of_a_job_is_raised(workers: int) -> None:
-    results = map_in_processes(square, [3, -1, 2], workers, "Squares", at_once=1, progress=False)
+    results = map_in_processes(square, [3, -1, 2], workers, "Squares", at_once=1)
     assert next(results)[0] == 9
     with pytest.raises(DatasetError, match="-1: is negative"):
         next(results)
     with pytest.raises(TypeError if workers > 1 else TwoArgumentsError, match="second"):
-        list(map_in_processes(square, [3, 1000, 2], workers, "Squares", at_once=1, progress=False))
+        list(map_in_processes(square, [3, 1000, 2], workers, "Squares", at_once=1))
 
 
 def unhurried(number: int) -> int:
@@ -73,7 +73,7 @@ def test_a_process_that_is_killed_while_it_waits_ends_the_work() -> None:
 
     The kernel kills where memory runs out.
     """
-    results = map_in_processes(unhurried, range(1000), 2, "Unhurried", at_once=1, progress=False)
+    results = map_in_processes(unhurried, range(1000), 2, "Unhurried", at_once=1)
     process = next(results)
     os.kill(process, signal.SIGKILL)
     deadline = time.monotonic() + 30
@@ -103,7 +103,7 @@ MAIN = """
 from asca_pillars.base.processes import map_in_processes
 from tests.base.test_processes import asleep
 if __name__ == "__main__":
-    list(map_in_processes(asleep, range(100), 2, "Asleep", at_once=1, progress=False))
+    list(map_in_processes(asleep, range(100), 2, "Asleep", at_once=1))
 """
 
 
@@ -145,5 +145,5 @@ def noted(folder: Path) -> Noting:
 
 def test_the_job_is_sent_once(tmp_path: Path) -> None:
     job = Noting(tmp_path)
-    assert list(map_in_processes(job, range(8), 2, "Noting", at_once=1, progress=False)) == [*range(8)]
+    assert list(map_in_processes(job, range(8), 2, "Noting", at_once=1)) == [*range(8)]
     assert len(list(tmp_path.iterdir())) == 2

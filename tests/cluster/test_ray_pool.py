@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 
 from asca_pillars.base.errors import ClusterError
+from asca_pillars.base.progress import Reporter
 from asca_pillars.cluster import ray_pool
 from asca_pillars.cluster.run_shards import run_items, run_shards
 from asca_pillars.cluster.shards import Shard, make_shards, process_shards
@@ -60,7 +61,13 @@ def test_all_is_done_while_a_machine_and_workers_die(cluster: Any, tmp_path: Pat
     (node,) = cluster.worker_nodes
     outcomes = []
     for outcome in run_shards(
-        partial(sum_slowly, work), shards, cluster.address, seen=seen, folders=[work], title="Adding", progress=False
+        partial(sum_slowly, work),
+        shards,
+        cluster.address,
+        seen=seen,
+        folders=[work],
+        title="Adding",
+        reporter=Reporter(),
     ):
         outcomes.append(outcome)
         if len(outcomes) == 3:
@@ -95,7 +102,9 @@ def test_each_item_is_done(cluster: Any, tmp_path: Path) -> None:
     left = out / ".1.asca-00000000"
     left.touch()
     job = partial(touch, out)
-    run_items(job, range(5), cluster.address, shard_size=2, seen=seen, folders=[out], title="Touching", progress=False)
+    run_items(
+        job, range(5), cluster.address, shard_size=2, seen=seen, folders=[out], title="Touching", reporter=Reporter()
+    )
     assert {path.name for path in out.iterdir()} == set("01234"), "and what a killed writer left is gone"
 
 

@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 
 from asca_pillars.base.processes import map_in_processes
+from asca_pillars.base.progress import SILENT, Reporter
 from asca_pillars.data.insertion.ground_fit import (
     GROUND_BAND_M,
     LATTICE_M,
@@ -157,7 +158,9 @@ VERSION = 2  # of the computation; files of another version are computed again
 _AT_ONCE = 16
 
 
-def prepare_free_spaces(split: LabeledSplit, prepared: Path, *, camera_view: bool, workers: int) -> None:
+def prepare_free_spaces(
+    split: LabeledSplit, prepared: Path, *, camera_view: bool, workers: int, reporter: Reporter = SILENT
+) -> None:
     """Make the files of all frames of a list that are missing or outdated.
 
     Raises:
@@ -165,7 +168,7 @@ def prepare_free_spaces(split: LabeledSplit, prepared: Path, *, camera_view: boo
     """
     require_writable(prepared)
     job = partial(_prepare, split, prepared, camera_view)
-    for _ in map_in_processes(job, split.frame_ids, workers, "Free ground", at_once=_AT_ONCE):
+    for _ in map_in_processes(job, split.frame_ids, workers, "Free ground", at_once=_AT_ONCE, reporter=reporter):
         pass
 
 

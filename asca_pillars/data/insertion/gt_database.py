@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from asca_pillars.base.files import portable_name
 from asca_pillars.base.processes import map_in_processes
+from asca_pillars.base.progress import SILENT, Reporter
 from asca_pillars.data.frames import read_frame
 from asca_pillars.data.insertion.prepared import require_writable, writable_atomic_path
 from asca_pillars.data.labeled_split import LabeledSplit
@@ -94,7 +95,13 @@ class ObjectDatabase:
 
 
 def prepare_database(
-    split: LabeledSplit, class_names: Sequence[str], prepared: Path, *, camera_view: bool, workers: int = 1
+    split: LabeledSplit,
+    class_names: Sequence[str],
+    prepared: Path,
+    *,
+    camera_view: bool,
+    workers: int = 1,
+    reporter: Reporter = SILENT,
 ) -> ObjectDatabase:
     """Return the database of a list's frames: the existing one if nothing has changed, else a new one.
 
@@ -104,6 +111,7 @@ def prepare_database(
         prepared: folder of per-dataset caches.
         camera_view: keep only points within the camera image.
         workers: processes that read the frames; their number does not change the result.
+        reporter: for the progress.
 
     Raises:
         DatasetError: a frame cannot be read, or the folder cannot be written.
@@ -119,7 +127,9 @@ def prepare_database(
     if not path.exists():
         require_writable(prepared)
         read = partial(_read_objects, split, tuple(class_names), camera_view)
-        _build(path, map_in_processes(read, split.frame_ids, workers, "Object database", at_once=_AT_ONCE), built_from)
+        title = "Object database"
+        objects = map_in_processes(read, split.frame_ids, workers, title, at_once=_AT_ONCE, reporter=reporter)
+        _build(path, objects, built_from)
     return ObjectDatabase(path)
 
 

@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_pillars.base.errors import DatasetError
+from asca_pillars.base.progress import SILENT, Reporter
 from asca_pillars.config.tree import DataConfig, InsertConfig
 from asca_pillars.data.frames import LabeledFrame, other_spelling
 from asca_pillars.data.insertion.free_placement import Scene, is_clear, move_to_free_position
@@ -70,7 +71,9 @@ class Inserter:
         return load_free_space(self.split, frame_id, self.prepared, camera_view=self.camera_view)
 
 
-def prepare_inserter(split: LabeledSplit, spec: DetectorSpec, data: DataConfig, insert: InsertConfig) -> Inserter:
+def prepare_inserter(
+    split: LabeledSplit, spec: DetectorSpec, data: DataConfig, insert: InsertConfig, reporter: Reporter = SILENT
+) -> Inserter:
     """Build or find the object database, and compute the probability of each class.
 
     It is built by as many processes as load batches later (`data.workers`).
@@ -80,7 +83,9 @@ def prepare_inserter(split: LabeledSplit, spec: DetectorSpec, data: DataConfig, 
     """
     prepared = prepared_folder(split.root, data)
     camera_view = data.camera_view and split.has_camera
-    database = prepare_database(split, spec.class_names, prepared, camera_view=camera_view, workers=data.workers)
+    database = prepare_database(
+        split, spec.class_names, prepared, camera_view=camera_view, workers=data.workers, reporter=reporter
+    )
     counted = (database.point_counts >= data.min_points) & spec.ranges.hold_centers(database.boxes)
     counts = np.bincount(database.labels[counted], minlength=len(spec.class_names))
     wanted = np.array([insert.proportions.get(name, 0.0) for name in spec.class_names])

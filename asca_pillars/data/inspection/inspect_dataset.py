@@ -10,9 +10,9 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.progress import track
 
 from asca_pillars.base.errors import DatasetError, ScanError
+from asca_pillars.base.progress import SILENT, Reporter
 from asca_pillars.config.tree import DataConfig
 from asca_pillars.data.inspection.box_conventions import ConventionFit, convention_fits
 from asca_pillars.data.inspection.measurements import (
@@ -157,7 +157,7 @@ def inspect_dataset(
     *,
     assigner: Assigner = "overlap",
     frames: int = 500,
-    progress: bool = False,
+    reporter: Reporter = SILENT,
 ) -> Inspection:
     """Measure `frames` evenly spaced frames of a split, or all of them if there are fewer.
 
@@ -167,7 +167,7 @@ def inspect_dataset(
         data: settings for reading the frames.
         assigner: assigner of anchors to boxes.
         frames: number of frames to measure.
-        progress: show a bar.
+        reporter: for the progress.
 
     Raises:
         DatasetError: a list, scan, calibration or label file is missing, anywhere in the split.
@@ -178,7 +178,7 @@ def inspect_dataset(
     selected = min(frames, in_split)
     measured: list[FrameMeasure] = []
     damaged: list[DatasetError | ScanError] = []
-    for number in track(range(selected), "Inspecting", disable=not progress, transient=True):
+    for number in reporter.track(range(selected), "Inspecting"):
         try:
             frame_id = split.frame_ids[number * in_split // selected]
             measured.append(measure_frame(split, frame_id, spec, data, assigner))

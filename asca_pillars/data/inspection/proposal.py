@@ -8,10 +8,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import yaml
-from rich.progress import track
 
 from asca_pillars.base.errors import DatasetError, OutputError
 from asca_pillars.base.files import write_text
+from asca_pillars.base.progress import SILENT, Reporter
 from asca_pillars.base.schema import to_dict
 from asca_pillars.config.tree import Config
 from asca_pillars.data.inspection.findings import FEWEST_BOXES
@@ -43,7 +43,7 @@ class Proposal(NamedTuple):
     rare: dict[str, int]
 
 
-def propose(split: LabeledSplit, config: Config, *, frames: int = 500, progress: bool = False) -> Proposal:
+def propose(split: LabeledSplit, config: Config, *, frames: int = 500, reporter: Reporter = SILENT) -> Proposal:
     """Return `config` with each type of FEWEST_BOXES or more visible boxes as a class, and a grid that contains them.
 
     An anchor has the median size and height of its boxes. A range of the grid is kept if it contains HELD of them.
@@ -52,7 +52,7 @@ def propose(split: LabeledSplit, config: Config, *, frames: int = 500, progress:
         split: the labels.
         config: the other settings.
         frames: number of frames to measure, evenly spaced.
-        progress: show a bar.
+        reporter: for the progress.
 
     Raises:
         DatasetError: a frame cannot be read, or no type has enough boxes.
@@ -62,7 +62,7 @@ def propose(split: LabeledSplit, config: Config, *, frames: int = 500, progress:
     clouds = []
     boxes_of: dict[str, list[Singles]] = {}
     findable: dict[str, list[Singles]] = {}
-    for frame_id in track(chosen, "Measuring", disable=not progress, transient=True):
+    for frame_id in reporter.track(chosen, "Measuring"):
         points = split.points(frame_id, camera_view=config.data.camera_view)
         boxes, types = split.labeled_boxes(frame_id)
         inside = points_in_boxes(points, boxes).sum(axis=0)
@@ -184,7 +184,9 @@ def _best_overlaps(boxes: Floats, size_m: Sequence[float], spec: InspectedSpec) 
     return best
 
 
-def propose_config(split: LabeledSplit, config: Config, path: Path, frames: int) -> tuple[Config, str]:
+def propose_config(
+    split: LabeledSplit, config: Config, path: Path, frames: int, reporter: Reporter = SILENT
+) -> tuple[Config, str]:
     """Measure and write to `path`; gives the configuration that was written, and its text.
 
     Raises:
@@ -193,7 +195,7 @@ def propose_config(split: LabeledSplit, config: Config, path: Path, frames: int)
     """
     if path.exists():
         raise OutputError(f"{path}: is there already and may have been edited; choose another name, or remove it")
-    proposal = propose(split, config, frames=frames, progress=True)
+    proposal = propose(split, config, frames=frames, reporter=reporter)
     boxes = ", ".join(f"{name} {count}" for name, count in proposal.boxes.items())
     notes = [f"Measured on {split.root}, {split.name}: {boxes} boxes."]
     if proposal.rare:

@@ -7,10 +7,10 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from rich.console import Console
 from torch import Tensor
 from torch.utils._pytree import tree_map_only
 
+from asca_pillars.base.progress import SILENT, Reporter
 from asca_pillars.config.tree import DataConfig
 from asca_pillars.config.two_stage import RefineConfig, RefineModel
 from asca_pillars.data.augment import move_scene
@@ -199,7 +199,9 @@ class RefinePreparation:
         return LabeledProposals(*batch, loss_mask, tuple(frame.proposals for frame in frames))
 
 
-def cached_preparation(model: RefineModel, split: LabeledSplit, data: DataConfig) -> RefinePreparation:
+def cached_preparation(
+    model: RefineModel, split: LabeledSplit, data: DataConfig, reporter: Reporter = SILENT
+) -> RefinePreparation:
     """Return the preparation for the frames of `split`; proposals that are not on disk yet are computed.
 
     Raises:
@@ -210,7 +212,7 @@ def cached_preparation(model: RefineModel, split: LabeledSplit, data: DataConfig
     folder = prepared_folder(split.root, data)
     view = data.camera_view and split.has_camera
     cache = ProposalCache(folder, split.pool, stage, model.refine.seen, camera_view=view)
-    cache.fill(split, workers=max(data.workers, 1), console=Console(stderr=True))
+    cache.fill(split, workers=max(data.workers, 1), reporter=reporter)
     return RefinePreparation(model.refine, CachedProposals(cache.files))
 
 

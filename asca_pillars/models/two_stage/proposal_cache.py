@@ -9,10 +9,10 @@ from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.console import Console
 
 from asca_pillars.base.errors import DatasetError
 from asca_pillars.base.processes import map_in_processes
+from asca_pillars.base.progress import SILENT, Reporter
 from asca_pillars.base.schema import to_dict
 from asca_pillars.data.insertion.prepared import require_writable, writable_atomic_path
 from asca_pillars.data.labeled_split import LabeledSplit
@@ -72,13 +72,13 @@ class ProposalCache:
         key = hashlib.sha256(json.dumps(about, sort_keys=True).encode()).hexdigest()[:12]
         self.files = ProposalFiles(prepared / pool / f"proposals-{key}", stage.spec.class_names)
 
-    def fill(self, split: LabeledSplit, *, workers: int = 1, console: Console | None = None) -> None:
+    def fill(self, split: LabeledSplit, *, workers: int = 1, reporter: Reporter = SILENT) -> None:
         """Compute what is missing or outdated. Each file appears when it is complete, so a killed run can be resumed.
 
         Args:
             split: frames.
             workers: processes; each opens the first stage for itself.
-            console: of the progress bar; None for none.
+            reporter: for the progress.
 
         Raises:
             DatasetError, ScanError: a frame cannot be read, or a file not written.
@@ -87,7 +87,7 @@ class ProposalCache:
         if todo:
             require_writable(self.prepared)
         propose = partial(_propose, self.files, split, self.stage, self.settings, self.camera_view)
-        for _ in map_in_processes(propose, todo, workers, "Proposing", progress=console is not None, console=console):
+        for _ in map_in_processes(propose, todo, workers, "Proposing", reporter=reporter):
             pass
 
     def _is_current(self, split: LabeledSplit, frame_id: str) -> bool:

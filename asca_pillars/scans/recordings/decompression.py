@@ -8,9 +8,8 @@ import tempfile
 from pathlib import Path
 from typing import IO, Any
 
-from rich.progress import Progress
-
 from asca_pillars.base.errors import ScanError
+from asca_pillars.base.progress import SILENT, Reporter
 from asca_pillars.scans.recordings.recording import reason
 
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
@@ -23,7 +22,7 @@ _BLOCK_BYTES = 2**20
 _SHOWN_BYTES = 2**28  # compressed files from this size on show their progress
 
 
-def decompress_file(source: Path) -> Path:
+def decompress_file(source: Path, reporter: Reporter = SILENT) -> Path:
     """Decompress a file of one of UNPACKERS into a temporary folder of its own, which the caller removes.
 
     Returns:
@@ -34,7 +33,7 @@ def decompress_file(source: Path) -> Path:
     """
     folder = Path(tempfile.mkdtemp(prefix="asca-unpacked-"))
     try:
-        _decompress_file(source, folder / source.stem)
+        _decompress_file(source, folder / source.stem, reporter)
     except BaseException as error:
         shutil.rmtree(folder, ignore_errors=True)
         if isinstance(error, ScanError) or not isinstance(error, Exception):
@@ -121,7 +120,7 @@ def _within_limit(unpacked: bytes, packed_bytes: int) -> bytes:
     return unpacked
 
 
-def _decompress_file(source: Path, target: Path) -> None:
+def _decompress_file(source: Path, target: Path, reporter: Reporter) -> None:
     """Decompress the intact part: readers of the copy report what is missing at its end."""
     from zstandard import frame_content_size
 
@@ -139,17 +138,14 @@ def _decompress_file(source: Path, target: Path) -> None:
             )
         packed.seek(0)
         written = 0
-        with (
-            Progress(transient=True, disable=packed_bytes < _SHOWN_BYTES) as progress,
-            _stream(packed, source.suffix.lower()) as stream,
-        ):
-            task = progress.add_task(f"Unpacking {source.name}", total=packed_bytes)
+        with _stream(packed, source.suffix.lower()) as stream:
             try:
                 while block := stream.read1(_BLOCK_BYTES):  # also what is intact before damage
                     written += len(block)
                     _refuse_file(source, written, limit)
                     unpacked.write(block)
-                    progress.update(task, completed=packed.tell())
+                    if packed_bytes >= _SHOWN_BYTES:
+                        reporter.progress(f"Unpacking {source.name}", packed.tell(), packed_bytes)
             except Exception as error:  # each library has errors of its own
                 is_damage = not isinstance(error, ScanError) and getattr(error, "errno", None) is None
                 if not (is_damage and written):

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from asca_pillars.base.errors import ScanError
 from asca_pillars.base.input_files import require_content
+from asca_pillars.base.progress import SILENT, Reporter
 from asca_pillars.scans.find_scans import is_scan, natural_order, visible_files
 from asca_pillars.scans.recordings.decompression import UNPACKERS, decompress_file
 from asca_pillars.scans.recordings.mcap_files import McapRecording
@@ -41,8 +42,8 @@ def recording_files(path: Path) -> list[Path]:
     return sorted(file for name in names for file in visible_files(path, name) if file.is_file())
 
 
-def open_recording(path: Path) -> Recording:
-    """Open a recording.
+def open_recording(path: Path, reporter: Reporter = SILENT) -> Recording:
+    """Open a recording; a large compressed file is unpacked, of which the reporter is told the progress.
 
     Raises:
         ScanError: it does not exist, cannot be read, or lies among scans.
@@ -50,20 +51,20 @@ def open_recording(path: Path) -> Recording:
     if not path.exists():
         raise ScanError(f"{path}: no such file or folder; check the path")
     if not path.is_dir():
-        return _open_file(path)
+        return _open_file(path, reporter)
     files, metadata = _files(path), read_metadata(path)
     if metadata is not None:
-        return _open_rosbag2(path, files, metadata)
+        return _open_rosbag2(path, files, metadata, reporter)
     if scan := next((file for file in sorted(path.iterdir()) if is_scan(Path(file.name))), None):
         raise ScanError(f"{path}: holds {files[0].name} and scans such as {scan.name}; give one or the other")
     if len(files) > 1:
         raise ScanError(
             f"{path}: {len(files)} recordings, and no {METADATA_FILE} that would make one of them; give one of them"
         )
-    return _open_file(files[0])
+    return _open_file(files[0], reporter)
 
 
-def _open_rosbag2(folder: Path, there: list[Path], metadata: BagMetadata) -> Recording:
+def _open_rosbag2(folder: Path, there: list[Path], metadata: BagMetadata, reporter: Reporter) -> Recording:
     """Open the listed files, or all if none of them is there; errors in some do not lose the others."""
     by_name = {_unpacked_name(path.name): path for path in there}
     listed = {name: by_name.get(_unpacked_name(name)) for name in metadata.files}
@@ -75,7 +76,7 @@ def _open_rosbag2(folder: Path, there: list[Path], metadata: BagMetadata) -> Rec
     recordings = []
     for file in filter(None, listed.values()):
         try:
-            recordings.append(_open_file(file))
+            recordings.append(_open_file(file, reporter))
         except ScanError as error:
             troubles.append(str(error))
     if not recordings:
@@ -84,7 +85,7 @@ def _open_rosbag2(folder: Path, there: list[Path], metadata: BagMetadata) -> Rec
     return SplitRecording(folder, recordings, metadata.counts, troubles[0] if troubles else None)
 
 
-def _open_file(path: Path) -> Recording:
+def _open_file(path: Path, reporter: Reporter) -> Recording:
     require_content(path, ScanError)
     try:
         if path.stat().st_size == 0:
@@ -92,7 +93,7 @@ def _open_file(path: Path) -> Recording:
         reader = _READERS[_recorded_suffix(path)]
         if path.suffix.lower() not in UNPACKERS:
             return reader(path, None)
-        copy = decompress_file(path)
+        copy = decompress_file(path, reporter)
         try:
             recording = reader(path, copy)
         except BaseException:

@@ -20,7 +20,7 @@ import yaml
 
 from asca_pillars.base.files import write_json, write_text
 from asca_pillars.base.own_files import require_own_file, starting_with
-from asca_pillars.base.progress import Progress
+from asca_pillars.base.progress import SILENT, Reporter
 from asca_pillars.data.boxes.box_records import FIELDS
 from asca_pillars.data.boxes.box_split import DATASET_FILE
 from asca_pillars.data.kitti import in_image, write_image_set
@@ -122,7 +122,7 @@ def simulate_sequences(
     config: SimulationConfig | None = None,
     *,
     val_share: float = 0.1,
-    progress: Progress | None = None,
+    reporter: Reporter = SILENT,
 ) -> Path:
     """Write `sequences` sequences of `length` scans each, at 10 Hz, below `out`; returns `out`.
 
@@ -142,7 +142,7 @@ def simulate_sequences(
     record_settings(root, {"seed": seed, "length": length, "rate_hz": RATE_HZ, **asdict(config)}, root / "scans")
     todo = [(one, index) for one in range(sequences) for index in range(length)]
     todo = [item for item in todo if not _scan_path(root, *item).exists()]
-    for_each(partial(_write_frame, root, plan), todo, workers, progress=progress)
+    for_each(partial(_write_frame, root, plan), todo, workers, reporter)
     first_val = sequences - held_out(sequences, val_share)
     for name, numbers in (("train", range(first_val)), ("val", range(first_val, sequences))):
         write_image_set(root, name, [f"{one:04d}/{index:06d}" for one in numbers for index in range(length)])

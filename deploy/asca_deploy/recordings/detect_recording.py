@@ -164,7 +164,7 @@ def _detect(task: _Task, reading: ScanSettings, options: RuntimeOptions, reporte
     task.files.check((task.path, task.calib))
     calibration = None if task.calib is None else read_calibration(task.calib)
     require_own_results(task.out, {JOURNAL_FILE: is_journal})
-    recording = open_recording(task.path)
+    recording = open_recording(task.path, reporter)
     topic = recording.point_cloud_topic(task.topic)
     if task.odometry is not None and not task.track:
         raise ConfigError(f"--odometry {task.odometry}: is for tracks; give --track, too")
