@@ -24,7 +24,7 @@ from tests.helpers.in_process import run_here
 from tests.helpers.scenes import make_scene, write_dataset
 from tests.helpers.tiny_run import CONFIG
 
-HEAVY = "torch lightning onnx onnxscript tensorboard sklearn scipy matplotlib openvino rosbags mcap rerun"
+HEAVY = "torch lightning onnx onnxscript tensorboard sklearn scipy matplotlib openvino rosbags mcap rerun ray"
 WITHOUT_TORCH = hiding(HEAVY, "from asca_pillars.cli.main import main\nmain()")
 IN_TURN = hiding(
     HEAVY,
