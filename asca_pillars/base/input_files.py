@@ -48,7 +48,7 @@ def read_text(path: str | Path, error: type[AscaError], *, errors: str = "strict
     Args:
         path: of the file.
         error: what `require_content` raises.
-        errors: what to do with bytes that are no UTF-8, as for `str.decode`.
+        errors: what to do with bytes that are not UTF-8, as for `str.decode`.
 
     Raises:
         AscaError: as `require_content`.

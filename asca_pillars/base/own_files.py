@@ -96,7 +96,7 @@ def require_own_file(
         path: the file.
         command: for the message.
         is_own: recognizes it.
-        inputs: that the command reads; None is no input.
+        inputs: that the command reads; None means no input.
 
     Raises:
         OutputError: something else is there, a link, or an input.
@@ -199,7 +199,7 @@ def require_no_link(path: str | Path, below: str | Path | None = None) -> None:
 
 
 def require_not_input(target: str | Path, inputs: Iterable[str | Path | None]) -> None:
-    """Refuse a target that is one of the inputs, or a folder with one of them in it; None is no input.
+    """Refuse a target that is one of the inputs, or a folder with one of them in it; None means no input.
 
     Raises:
         OutputError: names the input.

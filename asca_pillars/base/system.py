@@ -47,8 +47,8 @@ def check_threads(threads: int | None) -> int:
     """Return the number of CPU threads to use: the given one, or `default_threads` for None.
 
     Raises:
-        ConfigError: no whole number, less than one, or more than four for each CPU of the machine, which only wait for
-            each other.
+        ConfigError: it is not a whole number, less than one, or more than four for each CPU of the machine, which
+            only wait for each other.
     """
     if threads is None:
         return default_threads()

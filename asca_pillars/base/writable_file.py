@@ -12,7 +12,7 @@ from asca_pillars.base.own_files import Recognizer, require_own_file
 def require_writable(
     path: Path | None, command: str, is_own: Recognizer, inputs: Iterable[str | Path | None] = ()
 ) -> None:
-    """Make sure that a file can be written before minutes of work; None is no file.
+    """Make sure that a file can be written before minutes of work; None means no file.
 
     Arguments and errors: as of `require_own_file`.
     """

@@ -23,7 +23,7 @@ def average_checkpoints(paths: Sequence[str | Path], out: str | Path, shares: Se
         shares: of each, not negative; divided by their sum. None for equal ones.
 
     Raises:
-        ConfigError: there are fewer than two, or the shares are no weights of a mean.
+        ConfigError: there are fewer than two, or the shares are not the weights of a mean.
         TrainingError: one is missing or damaged, or they are of different networks.
     """
     if len(paths) < 2:

@@ -87,7 +87,7 @@ def read_plain(path: Path) -> dict[str, Any]:
         ValueError: it holds something else than a dictionary.
         Exception: whatever the damaged bytes happen to trigger in `torch.load`.
     """
-    with warnings.catch_warnings(action="ignore"):  # from pickles that are no checkpoints, which raise an error
+    with warnings.catch_warnings(action="ignore"):  # from pickles that are not checkpoints, which raise an error
         content = torch.load(path, map_location="cpu", weights_only=True)
     if not isinstance(content, dict):
         raise ValueError(f"it holds a {type(content).__name__}, where a checkpoint holds a dictionary")
@@ -109,7 +109,7 @@ def read_failure(error: Exception) -> str:
     if isinstance(error, pickle.UnpicklingError):
         return "it is not plain arrays and settings; nothing in it was executed"
     if isinstance(error, KeyError):
-        return f"no {error}" if isinstance(error.args[0], str) else "it is no file of torch.save"
+        return f"no {error}" if isinstance(error.args[0], str) else "it was not written by torch.save"
     return str(error).splitlines()[0] if str(error) else type(error).__name__
 
 
@@ -139,7 +139,7 @@ def write_plain(content: Mapping[str, Any], path: str | Path) -> None:
 
 
 def require_new_checkpoint(path: Path) -> None:
-    """Raise OutputError if a checkpoint cannot be written to `path`: its name is no checkpoint's, or it exists."""
+    """Raise OutputError if a checkpoint cannot be written to `path`: its name is not a checkpoint's, or it exists."""
     if path.suffix != Path(WEIGHTS_FILE).suffix:
         raise OutputError(f"{path}: give a name that ends in .ckpt, by which the other commands know a checkpoint")
     if path.exists():

@@ -33,7 +33,7 @@ def find_scans(path: str | Path) -> list[Path]:
     """Return the scan at `path`, or all scans below the folder at `path`, in natural order (2.bin before 10.bin).
 
     Hidden files and folders and the output of `asca prepare` are left out; links to folders are followed. Entries with
-    the name of a scan that are no regular files, and broken links, are refused when they are read.
+    the name of a scan that are not regular files, and broken links, are refused when they are read.
 
     Raises:
         ScanError: there is no scan.

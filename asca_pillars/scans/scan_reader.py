@@ -149,7 +149,8 @@ def read_raw_floats(path: Path, columns: int | None = None) -> StoredPoints:
         columns: values per point, 3 to 16; None: four or five, whichever fits the values.
 
     Raises:
-        ScanError: no whole number of points, more than MAX_POINTS, or both four and five columns are plausible.
+        ScanError: the size is not that of whole points, there are more than MAX_POINTS of them, or both four and five
+            columns are plausible.
     """
     if columns is not None and not 3 <= columns <= MAX_COLUMNS:
         raise ScanError(f"columns {columns}: a point has 3 to {MAX_COLUMNS} values")
@@ -162,9 +163,9 @@ def read_raw_floats(path: Path, columns: int | None = None) -> StoredPoints:
         columns = _columns(path, size, data)
         remarks = (f"read as {columns} columns ({_FIVE}), which the values fit",) if columns == 5 else ()
     if size % (4 * columns):
+        each = f"{4 * columns} bytes per point (float32 {_FOUR if columns == 4 else f'in {columns} columns'})"
         raise ScanError(
-            f"{path}: {size} bytes are no whole number of points of {4 * columns} (float32 "
-            f"{_FOUR if columns == 4 else f'in {columns} columns'}); state other columns "
+            f"{path}: file size ({size} byte{'s'[: size != 1]}) is not a multiple of {each}; state other columns "
             f"(--columns), or {AGAIN}"
         )
     table = data.reshape(-1, columns)

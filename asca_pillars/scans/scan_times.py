@@ -53,7 +53,7 @@ def _read_times(path: Path) -> list[int]:
     except OSError as error:
         raise ScanError(f"{path}: cannot be read ({error.strerror or error}); check the path") from None
     except UnicodeDecodeError:
-        raise ScanError(f"{path}: is no text; list the seconds of each scan, one in a line") from None
+        raise ScanError(f"{path}: is not text; list the seconds of each scan, one in a line") from None
     stamps: list[int] = []
     for number, line in enumerate(lines, start=1):
         if not (text := line.strip()):
@@ -63,7 +63,7 @@ def _read_times(path: Path) -> list[int]:
         except InvalidOperation:
             seconds = Decimal("NaN")
         if seconds.is_nan() or not 0 <= seconds <= _MAX_TIME_S:
-            raise ScanError(f"{path}:{number}: {text[:40]!r} is no time; give seconds, 0 or more")
+            raise ScanError(f"{path}:{number}: {text[:40]!r} is not a time; give seconds, 0 or more")
         time_ns = round(seconds * 1_000_000_000)
         if stamps and time_ns <= stamps[-1]:
             raise ScanError(f"{path}:{number}: {text[:40]} is not after the time before it; list times that ascend")

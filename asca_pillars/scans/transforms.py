@@ -21,7 +21,7 @@ class Transforms:
         self._parents: dict[str, tuple[str, NDArray[np.float64]]] = {}
 
     def add(self, message: Any) -> None:
-        """Store the transforms of a `tf2_msgs/TFMessage`, except those that are no rotation and translation."""
+        """Store the transforms of a `tf2_msgs/TFMessage`, except those that are not a rotation and translation."""
         for one in message.transforms:
             shift, turn = one.transform.translation, one.transform.rotation
             matrix = np.eye(4)

@@ -143,7 +143,7 @@ def _unusable_reason(path: Path, model: ModelConfig) -> str | None:
     except _UNREADABLE as error:
         return f"is damaged ({read_failure(error)})"
     if "state_dict" not in content:
-        return "is no checkpoint of a run (no 'state_dict')"
+        return "is not a checkpoint of a run (no 'state_dict')"
     if any(name not in content for name in _OF_A_RUN):
         return _WEIGHTS_ALONE
     for name, kind in _OF_A_RUN.items():

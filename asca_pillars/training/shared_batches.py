@@ -41,7 +41,7 @@ class SharedInputs:
     """The inputs of a batch in anonymous memory; the process that unpickles it gets the inputs themselves.
 
     Args:
-        inputs: tensors in tuples and NamedTuples, to any depth; what is no tensor travels as it is.
+        inputs: tensors in tuples and NamedTuples, to any depth; what is not a tensor travels as it is.
 
     Raises:
         OSError: no memory, or no more open files.

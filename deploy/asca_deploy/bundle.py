@@ -308,4 +308,4 @@ def weights_digest(bundle: Bundle) -> str:
 
 def _require_sha256(text: str | None, of: str) -> None:
     if text is not None and not re.fullmatch("[0-9a-f]{64}", text):
-        raise ConfigError(f"sha256 {text[:_LONGEST_NAME]!r} of {of} is no SHA-256")
+        raise ConfigError(f"sha256 {text[:_LONGEST_NAME]!r} of {of} is not a SHA-256")

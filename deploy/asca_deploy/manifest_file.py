@@ -28,7 +28,7 @@ def read_manifest(manifest: Path) -> dict[str, Any]:
     except (FileNotFoundError, NotADirectoryError):
         refuse_run_folder(manifest.parent)
         raise BundleError(
-            f"{manifest.parent} is no model bundle, it holds no {MANIFEST}; make one with `asca export`"
+            f"{manifest.parent} is not a model bundle, it holds no {MANIFEST}; make one with `asca export`"
         ) from None
     except OSError as error:
         raise BundleError(f"{manifest}: {error.strerror}") from None
@@ -94,4 +94,4 @@ def _without_duplicates(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def _no_number(word: str) -> Any:
-    raise ValueError(f"{word} is no number")
+    raise ValueError(f"{word} is not a number")

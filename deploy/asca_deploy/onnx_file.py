@@ -31,7 +31,7 @@ def read_metadata(model: bytes) -> dict[str, str]:
     """Return the `metadata_props` of a model.
 
     Raises:
-        ValueError: this is no ONNX file.
+        ValueError: this is not an ONNX file.
     """
     found = {}
     for number, value in _fields(memoryview(model)):
@@ -45,7 +45,7 @@ def has_external_data(model: bytes) -> bool:
     """Return whether any tensor of a model lies in another file.
 
     Raises:
-        ValueError: this is no ONNX file.
+        ValueError: this is not an ONNX file.
     """
     return _leads_outside(memoryview(model), "model", _DEEPEST)
 
@@ -81,9 +81,9 @@ def _fields(message: _Message) -> Iterator[tuple[int, int | memoryview]]:
         elif wire in _FIXED_BYTES:
             size = _FIXED_BYTES[wire]
         else:
-            raise ValueError(f"no ONNX file: wire type {wire}")
+            raise ValueError(f"not an ONNX file: wire type {wire}")
         if size > len(message) - place:
-            raise ValueError("no ONNX file: it ends within a field")
+            raise ValueError("not an ONNX file: it ends within a field")
         yield number, message[place : place + size]
         place += size
 
@@ -93,10 +93,10 @@ def _varint(message: _Message, place: int) -> tuple[int, int]:
     value = 0
     for shift in range(0, 70, 7):
         if place >= len(message):
-            raise ValueError("no ONNX file: it ends within a number")
+            raise ValueError("not an ONNX file: it ends within a number")
         byte = message[place]
         place += 1
         value |= (byte & 0x7F) << shift
         if byte < 0x80:
             return value, place
-    raise ValueError("no ONNX file: a number has no end")
+    raise ValueError("not an ONNX file: a number has no end")

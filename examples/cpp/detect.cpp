@@ -24,7 +24,7 @@ std::vector<float> read_points(const std::string& path) {
     std::ifstream file(path, std::ios::binary);
     if (!file) throw std::runtime_error(path + ": cannot be read");
     const std::vector<char> bytes{std::istreambuf_iterator<char>(file), {}};
-    if (bytes.size() % 16) throw std::runtime_error(path + ": no whole number of points of 16 bytes");
+    if (bytes.size() % 16) throw std::runtime_error(path + ": file size is not a multiple of 16 bytes per point");
     std::vector<float> values(bytes.size() / 4), points;
     std::memcpy(values.data(), bytes.data(), bytes.size());
     for (size_t i = 0; i < values.size(); i += 4) {

@@ -158,7 +158,7 @@ def with_ranges(spec: DetectorSpec, range_m: tuple[float, float, float, float]) 
     """Return the same detector with other ranges: from x0 to x1 and from y0 to y1, metres, LiDAR frame.
 
     Raises:
-        ConfigError: it is no detector on pillars, or pillars do not fill these ranges; the nearest that fit are named.
+        ConfigError: it is not a pillar detector, or pillars do not fill these ranges; the nearest that fit are named.
     """
     if not isinstance(spec, PillarSpec):
         raise ConfigError("--range: only detectors on pillars look elsewhere with the same weights; leave it out")

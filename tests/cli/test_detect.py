@@ -55,7 +55,7 @@ def test_a_damaged_scan_is_named_and_the_others_are_detected(
     with pytest.raises(ScanError, match=r"1 of 3 scans could not be read"):
         detect([scans], out=out, pictures=False)
     captured = capsys.readouterr()
-    assert r"\x1b[31m\n2.bin: 4 bytes" in captured.err and "3.bin" in captured.out
+    assert r"\x1b[31m\n2.bin: file size (4 bytes)" in captured.err and "3.bin" in captured.out
     assert files(out).keys() == {"1.json", "3.json", "detections.jsonl"}
     for name in ("1.bin", "3.bin"):
         (scans / name).write_bytes(b"torn")

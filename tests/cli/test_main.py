@@ -111,7 +111,7 @@ def test_detect_refuses_in_one_line(tmp_path: Path) -> None:
     for name in ("truncated.bin", "scan.las"):
         (tmp_path / name).write_bytes(b"x")
     for arguments, message in (
-        (("truncated.bin", "--out", "out"), "truncated.bin: 1 byte"),
+        (("truncated.bin", "--out", "out"), "truncated.bin: file size (1 byte)"),
         (("scan.las", "--out", "out"), "unknown suffix '.las'"),
         (("none.bin", "--out", "out"), "no such file or folder"),
         (("--bundle", tmp_path), "bundle.json"),

@@ -175,7 +175,7 @@ def test_new_processes_have_the_mounting_of_the_detector(
 def test_a_new_process_that_fails_says_why(bundle_copy: Path, scan: Points) -> None:
     detector = Detector(bundle_copy)
     (bundle_copy / "bundle.json").unlink()
-    with pytest.raises(AscaError, match="no model bundle"):
+    with pytest.raises(AscaError, match="not a model bundle"):
         cold_start(detector, scan, repeats=1)
 
 

@@ -174,7 +174,7 @@ def test_mistakes_are_one_line(detect: Path, tiny_bundle: Path, tmp_path: Path) 
         ([tmp_path, sample_scan_path()], "bundle.json: cannot be read"),
         ([pooled, sample_scan_path()], "pooled: needs schema 3, kind pillar and a warped map"),
         ([every, sample_scan_path()], "every: needs anchors at cell centers with one score for each"),
-        ([tiny_bundle, tmp_path / "torn.bin"], "torn.bin: no whole number of points"),
+        ([tiny_bundle, tmp_path / "torn.bin"], "torn.bin: file size is not a multiple of 16"),
         ([], "usage: detect BUNDLE SCAN.bin [REPEATS]"),
     ):
         result = subprocess.run([detect, *arguments], capture_output=True, text=True)

@@ -242,5 +242,5 @@ def test_the_points_are_remembered_as_long_as_the_caller_keeps_them(tiny_bundle:
 
 def test_without_a_bundle_the_shipped_one_is_meant(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr("asca_deploy.shipped.default_bundle_path", lambda: tmp_path / "shipped")
-    with pytest.raises(BundleError, match="shipped is no model bundle"):
+    with pytest.raises(BundleError, match="shipped is not a model bundle"):
         Detector()

@@ -135,8 +135,8 @@ def test_a_signed_layout_that_does_not_follow_from_the_spec(bundle_copy: Path, m
         (lambda data: data["expected_input"].update(ground_z_m=[1.0, -1.0]), r"ground_z_m = .* lowest and highest"),
         (lambda data: data["spec"].pop("post"), r"`spec\.post` is missing"),
         (lambda data: data["graphs"].pop("encoder"), "graphs encoder and backbone, not backbone"),
-        (lambda data: data["graphs"]["encoder"].update(sha256="0\x1b[31m"), r"sha256 .* is no SHA-256"),
-        (lambda data: data["provenance"].update(weights_sha256="0" * 63), "sha256 .* of the weights is no SHA-256"),
+        (lambda data: data["graphs"]["encoder"].update(sha256="0\x1b[31m"), r"sha256 .* is not a SHA-256"),
+        (lambda data: data["provenance"].update(weights_sha256="0" * 63), "sha256 .* of the weights is not a SHA-256"),
     ],
 )
 def test_wrong_keys_and_values(bundle_copy: Path, change: Callable[[dict[str, Any]], object], message: str) -> None:
@@ -179,7 +179,7 @@ def test_duplicate_keys_and_deep_nesting(bundle_copy: Path) -> None:
 def test_no_bundle_there(tmp_path: Path) -> None:
     (tmp_path / "last.ckpt").write_bytes(b"weights")
     for path in (tmp_path / "nowhere", tmp_path, tmp_path / "last.ckpt"):
-        assert_refused(path, "is no model bundle")
+        assert_refused(path, "is not a model bundle")
 
 
 def test_provenance_need_not_say_which_weights(bundle_copy: Path) -> None:

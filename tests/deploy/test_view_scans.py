@@ -116,7 +116,7 @@ def test_a_scan_that_cannot_be_read_is_said_and_others_go_on(server: ScanServer)
     for suffix in ("bin", "json"):
         with pytest.raises(urllib.error.HTTPError) as error:
             get(server, f"scans/1.{suffix}")
-        assert error.value.code == 422 and b"2.bin: 5 bytes" in error.value.read()
+        assert error.value.code == 422 and b"2.bin: file size (5 bytes)" in error.value.read()
     assert len(json.loads(get(server, "scans/2.json"))["detections"]) > 0
 
 
@@ -168,7 +168,7 @@ def test_a_turned_sensor_is_drawn_level_and_saved_in_its_own_frame(tmp_path: Pat
 
 
 def test_what_cannot_be_shown_is_one_line(folder: Path, tmp_path: Path) -> None:
-    with pytest.raises(ScanError, match=r"2\.bin: 5 bytes"):
+    with pytest.raises(ScanError, match=r"2\.bin: file size \(5 bytes"):
         ScanServer([folder / "2.bin"], options=SMALL)
     (tmp_path / "drive.mcap").write_bytes(b"\x89MCAP0\r\n")
     with pytest.raises(ConfigError, match=r"drive\.mcap: is a recording; look at it with asca detect --rerun"):
@@ -223,7 +223,7 @@ def test_the_browser_shows_them(server: ScanServer, tmp_path: Path) -> None:
         assert len(more) > len(saved["boxes"])
         arrow = "document.dispatchEvent(new KeyboardEvent('keydown', { key: 'ArrowRight' }))"
         tab.evaluate(arrow)
-        assert "2.bin: 5 bytes" in failure(tab)
+        assert "2.bin: file size (5 bytes)" in failure(tab)
         tab.evaluate(arrow)
         finished(tab, server_scan(server, 2))
 

@@ -66,7 +66,7 @@ def test_what_is_none_of_ours_is_named(tmp_path: Path, capfd: pytest.CaptureFixt
         torch.save(content, path)
         with pytest.raises(TrainingError, match=message):
             load_checkpoint(path)
-    for data, message in ((b"hello", "it is no file of torch.save"), (pickle.dumps({"a": 1}), "not a checkpoint")):
+    for data, message in ((b"hello", "it was not written by torch.save"), (pickle.dumps({"a": 1}), "not a checkpoint")):
         path.write_bytes(data)
         with pytest.raises(TrainingError, match=message):
             load_checkpoint(path)

@@ -158,7 +158,7 @@ ASCII_PCD, ASCII_PLY = pcd("ascii"), ply("ascii")
     ("name", "content", "word"),
     [
         ("a.bin", b"", "empty (0 bytes)"),
-        ("a.bin", bytes(40), "40 bytes are no whole number of points of 16"),
+        ("a.bin", bytes(40), "file size (40 bytes) is not a multiple of 16"),
         ("a.xyz", b"1 2 3", ", ".join(SCAN_SUFFIXES)),
         ("a.npy", npy(POINTS[:, 0].copy()), "(4,)"),
         ("a.npy", npy(POINTS)[:-1], "not an array of numbers"),
@@ -363,7 +363,7 @@ def test_a_folder_has_one_scale(tmp_path):
     ("stored", "said"),
     {
         "five": (NUSCENES, True),
-        "five, no whole number of four": (NUSCENES[:3999], True),
+        "five, not a multiple of four": (NUSCENES[:3999], True),
         "five, rings left out by an exporter": (NUSCENES * np.array([1, 1, 1, 1, 0], np.float32), True),
         "four": (STREET, False),
     }.values(),

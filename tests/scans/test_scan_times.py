@@ -27,9 +27,9 @@ def test_times_by_a_rate_begin_at_0_and_those_of_a_file_are_its_seconds(tmp_path
         ("0\n0.1\n", r"times\.txt: 2 times for 3 scans"),
         ("0\n0.2\n0.1\n", r"times\.txt:3: 0\.1 is not after"),
         ("0\n0.1\n0.1\n", r"times\.txt:3: 0\.1 is not after"),
-        ("0\nnan\n0.1\n", r"times\.txt:2: 'nan' is no time"),
-        ("0\n1e30\n2e30\n", r"times\.txt:2: '1e30' is no time"),
-        ("time\n0\n0.1\n", r"times\.txt:1: 'time' is no time"),
+        ("0\nnan\n0.1\n", r"times\.txt:2: 'nan' is not a time"),
+        ("0\n1e30\n2e30\n", r"times\.txt:2: '1e30' is not a time"),
+        ("time\n0\n0.1\n", r"times\.txt:1: 'time' is not a time"),
     ],
 )
 def test_files_that_list_no_times_are_refused(tmp_path: Path, text: str, message: str) -> None:
@@ -40,7 +40,7 @@ def test_files_that_list_no_times_are_refused(tmp_path: Path, text: str, message
 
 def test_what_is_no_text_and_scans_of_several_folders_are_refused(tmp_path: Path) -> None:
     (tmp_path / "times.txt").write_bytes(b"\xff\xfe0")
-    for path, message in ((tmp_path / "times.txt", "is no text"), (tmp_path / "none.txt", "none.txt: ")):
+    for path, message in ((tmp_path / "times.txt", "is not text"), (tmp_path / "none.txt", "none.txt: ")):
         with pytest.raises(ScanError, match=message):
             scan_times_ns(3, times=path)
     require_one_folder([Path("a/1.bin"), Path("a/2.bin")])

@@ -122,7 +122,7 @@ def test_what_is_no_state_of_a_run_is_named(tmp_path: Path) -> None:
     other = {"detector.encode.linear.weight": torch.zeros(3, 9)}
     for content, message in (
         (weights, r"last\.ckpt holds weights alone, not the state of a run .*--init .*last\.ckpt"),
-        (whole["state_dict"], r"last\.ckpt is no checkpoint of a run"),
+        (whole["state_dict"], r"last\.ckpt is not a checkpoint of a run"),
         (torch.zeros(3), "is damaged .*it holds a Tensor"),
         ([1, 2], r"last\.ckpt is damaged .*it holds a list.*--init .*best\.ckpt"),
         (whole | {"state_dict": 3}, "is damaged .`state_dict` is a int"),

@@ -224,7 +224,7 @@ def _records(placed: Iterable[tuple[str, Any]]) -> BoxRecords:
     for place, record in placed:
         if not isinstance(record, Mapping):
             raise DatasetError(
-                f"{place}: {str(record)[:40]} is no record; write an object with `class` and {_listed()}"
+                f"{place}: {str(record)[:40]} is not a record; write an object with `class` and {_listed()}"
             )
         kind = record.get("class")
         if not isinstance(kind, str) or not kind.strip():

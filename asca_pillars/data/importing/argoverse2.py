@@ -53,7 +53,7 @@ def _frames(log: Path, left_out: SkippedEntries) -> list[ImportedFrame]:
     table = feather_table(path, numbers, ("track_uuid", "category"), DatasetError)
     stamps = table["timestamp_ns"]
     if stamps.dtype.kind not in "iu":
-        raise DatasetError(f"{path}: column `timestamp_ns` has no whole numbers; copy the file again")
+        raise DatasetError(f"{path}: column `timestamp_ns` does not hold whole numbers; copy the file again")
     with np.errstate(invalid="ignore", over="ignore"):
         turns = rotations_from_quaternions(np.column_stack([table[name] for name in _TURN]).astype(np.float64))
         yaw = np.arctan2(turns[:, 1, 0], turns[:, 0, 0])

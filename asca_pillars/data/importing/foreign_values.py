@@ -56,7 +56,7 @@ def whole_number(value: Any, name: str) -> int:
     """
     number = int(value) if isinstance(value, int | np.integer) and not isinstance(value, bool) else None
     if number is None or not -(2**63) <= number < 2**63:
-        raise ValueError(f"{name} is {_QUOTE.repr(value)}, no whole number")
+        raise ValueError(f"{name} is {_QUOTE.repr(value)}, not a whole number")
     return number
 
 

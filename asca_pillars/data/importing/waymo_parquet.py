@@ -193,7 +193,7 @@ def _rigid(values: Any, name: str) -> Doubles:
     """Return a rigid transform (4, 4) of 16 numbers."""
     matrix = numbers(values, 16, name).reshape(4, 4)
     if not is_rigid(matrix):
-        raise ValueError(f"{name} is no rotation and shift")
+        raise ValueError(f"{name} is not a rotation and a translation")
     return matrix
 
 

@@ -1,7 +1,7 @@
 """Waymo's range images as points in the vehicle's frame, by the formulas of its published tools (v2, `lidar_utils`).
 
 A row is a laser, from the highest down; a column is an azimuth, the first one behind the sensor, turning clockwise. A
-pixel holds range (m), intensity, elongation and whether it is in a no-label zone; a range of 0 is no return.
+pixel holds range (m), intensity, elongation and whether it is in a no-label zone; a range of 0 means no return.
 """
 
 from typing import NamedTuple

@@ -165,7 +165,7 @@ def read_calibration(path: str | Path) -> Calibration:
         if np.abs(matrix[:, :3] @ matrix[:, :3].T - np.eye(3)).max() > 0.01:
             raise DatasetError(f"{path}: {key} is not a rotation; restore the file")
     if not abs(np.linalg.det(matrices[0][:, :3])) > 0:
-        raise DatasetError(f"{path}: {_KEYS[0][0]} is no projection, nothing would be in the image; restore the file")
+        raise DatasetError(f"{path}: {_KEYS[0][0]} is not a projection: no point would be in the image; restore it")
     return Calibration(*matrices)
 
 

@@ -29,7 +29,7 @@ _DEEPEST = 64  # folders of a scan's path that are compared
 def predictions_by_frame(path: Path, split: LabeledSplit) -> dict[str, NamedRecords]:
     """Assign the lines of a *.jsonl or *.csv file to frames; lines of other frames are left out.
 
-    A message of a recording (a line with a time, whose scan is no file: `drive.mcap/000003`) is assigned by
+    A message of a recording (a line with a time, whose scan is not a file: `drive.mcap/000003`) is assigned by
     its time. Its number is not a frame's name: a recording may begin later than the dataset. A file is assigned to the
     frame whose id is the longest end of its path; without one, by its time, if it has one.
 

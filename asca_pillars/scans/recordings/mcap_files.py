@@ -31,7 +31,7 @@ _FIRST_PRIVATE = 0x80  # opcode
 _RECORD, _MESSAGE_HEAD = struct.Struct("<BQ"), struct.Struct("<HIQQ")
 _FOOTER_BYTES = 9 + 20 + 8  # with the magic bytes at the end of the file
 _MAX_OTHER_RECORDS = 2**18
-"""Largest number of records of a chunk that are no messages; twice the number of possible channels and schemas."""
+"""Largest number of records of a chunk that are not messages; twice the number of possible channels and schemas."""
 _MAX_OPEN_BYTES = 2**28
 """Largest size of the chunks merged by time, bytes; beyond it, messages may be out of order."""
 
@@ -288,7 +288,7 @@ class McapRecording(Recording):
                     continue
                 others += 1
                 if others > _MAX_OTHER_RECORDS:
-                    raise ValueError(f"more than {_MAX_OTHER_RECORDS} records that are no messages")
+                    raise ValueError(f"more than {_MAX_OTHER_RECORDS} records that are not messages")
                 if opcode in (_SCHEMA, _CHANNEL):
                     number = data[start] | data[start + 1] << 8
                     if number not in (self._known.schemas if opcode == _SCHEMA else self._known.channels):

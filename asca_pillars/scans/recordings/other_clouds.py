@@ -141,7 +141,7 @@ def _of_json(data: bytes) -> dict[str, Any]:
     try:
         body = base64.b64decode(content["data"], validate=True)
     except binascii.Error as error:
-        raise ValueError(f"its data are no Base64 ({error})") from None
+        raise ValueError(f"its data are not Base64 ({error})") from None
     return content | {
         "data": body,
         "time": (int(time.get("sec", 0)), int(time.get("nsec", 0))),

@@ -61,7 +61,7 @@ def notes(result: LikeForLike) -> list[str]:
     lines = [
         f"Each real object is compared with the {NEIGHBORS} simulated ones of its class that are nearest to it in "
         "distance, angle of view and occlusion (for scores, in points, too); of points and pillars geometric means.",
-        "Percentile: of the real object among them, mean and standard error; 0.5 is no gap.",
+        "Percentile: of the real object among them, mean and standard error; 0.5 means no gap.",
     ]
     if result.firing is not None:
         lines.append(f"Scores and firing (a person or cyclist of {FIRING_SCORE:g} or more): {result.detector}.")

@@ -31,10 +31,10 @@ export function readScan(name, buffer) {
 
 /** Little-endian float32 without a header: x, y, z, reflectance, and of some exporters the ring. */
 function readBin(buffer) {
-  if (buffer.byteLength % 4) throw new Error(`${buffer.byteLength} bytes are no whole number of float32; ${AGAIN}`);
+  if (buffer.byteLength % 4) throw new Error(`${buffer.byteLength} bytes are not a multiple of 4; ${AGAIN}`);
   const values = new Float32Array(buffer);
   const columns = binColumns(values);
-  if (values.length % columns) throw new Error(`${values.length} values are no whole number of points; ${AGAIN}`);
+  if (values.length % columns) throw new Error(`${values.length} values are not a multiple of ${columns}; ${AGAIN}`);
   const count = values.length / columns;
   const column = (index) => Float64Array.from({ length: count }, (_, row) => values[row * columns + index]);
   const remarks = columns === 5 ? ["read as 5 columns: x, y, z, reflectance, ring"] : [];

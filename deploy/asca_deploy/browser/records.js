@@ -74,7 +74,7 @@ function asNumber(word) {
   if (/^[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)(e[+-]?[0-9]+)?$/i.test(word)) return Number(word);
   if (/^[+-]?nan$/i.test(word)) return NaN;
   if (/^[+-]?inf(inity)?$/i.test(word)) return word.startsWith("-") ? -Infinity : Infinity;
-  throw new Error(`'${word.slice(0, 20)}' is no number; ${AGAIN}`);
+  throw new Error(`'${word.slice(0, 20)}' is not a number; ${AGAIN}`);
 }
 
 /** `count` numbers of a field, `step` bytes apart. */

@@ -52,7 +52,7 @@ class Journal:
 
     Raises:
         OutputError: when the block is entered, if another process works in `folder`, or a file of the journal's name
-            is no journal.
+            is not a journal.
     """
 
     def __init__(self, folder: Path, about: dict[str, Any], class_names: tuple[str, ...]) -> None:
@@ -78,7 +78,7 @@ class Journal:
             require_no_link(self.path)
             if self.path.exists() and not is_journal(self.path):
                 raise OutputError(
-                    f"{self.path}: is no journal of `{COMMAND}`, or damaged in its first line; delete it or move it "
+                    f"{self.path}: is not a journal of `{COMMAND}`, or damaged in its first line; delete it or move it "
                     "away, or choose another --out"
                 )
             kept = self._whole_lines()

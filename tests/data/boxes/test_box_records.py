@@ -91,7 +91,7 @@ def with_box(**changes: object) -> str:
         ("l.jsonl", '{"scan": "a", "boxes": []}\n{"scan"', r"l\.jsonl:2: not valid JSON"),
         ("l.jsonl", '{"boxes": []}', r'l\.jsonl:1: no "scan"'),
         ("l.jsonl", '{"scan": "a"}', r'l\.jsonl:1: no list "boxes"'),
-        ("l.jsonl", '{"scan": "a", "boxes": [7]}', r"l\.jsonl:1, box 1: 7 is no record"),
+        ("l.jsonl", '{"scan": "a", "boxes": [7]}', r"l\.jsonl:1, box 1: 7 is not a record"),
         ("l.jsonl", json.dumps({"scan": "a", "boxes": [BOX, BOX | {"x_m": "far"}]}), r"1, box 2: x_m is 'far'"),
         ("l.jsonl", with_box(x_m=True), r"box 1: x_m is 'True'"),
         ("l.jsonl", with_box(x_m=10**400), r"box 1: x_m is '1000"),

@@ -38,7 +38,7 @@ def test_a_time_stamp_makes_no_path(name: str, table: str, tmp_path: Path) -> No
     target = name.format("stolen", tmp_path)
     change_parquet(source / table / "segment.parquet", column, lambda old: [target] * len(old), False)
     before = set(tmp_path.rglob("*"))
-    with pytest.raises(DatasetError, match=r"key\.frame_timestamp_micros is '.*', no whole number"):
+    with pytest.raises(DatasetError, match=r"key\.frame_timestamp_micros is '.*', not a whole number"):
         invoke("import", source, out, "--from", "waymo")
     assert all(path.is_relative_to(out) for path in set(tmp_path.rglob("*")) - before)
 

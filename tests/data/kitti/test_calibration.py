@@ -90,7 +90,7 @@ def test_calibration_round_trip_all_seven_lines_and_the_tracking_benchmarks_spel
         ("P2: 7.000000000000e+02", "P2:", ["P2", "11", "12"]),
         ("P2: 7.000000000000e+02", "P2: seven", ["P2", "seven"]),
         ("P2: 7.000000000000e+02", "P2: nan", ["P2", "finite"]),
-        ("P2: ", f"P2: {'0 ' * 12}\nP9: ", ["P2 is no projection"]),
+        ("P2: ", f"P2: {'0 ' * 12}\nP9: ", ["P2 is not a projection"]),
         ("R0_rect: 1.000000000000e+00", "R0_rect: 0", ["R0_rect", "rotation"]),
     ],
 )

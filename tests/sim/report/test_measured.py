@@ -92,7 +92,7 @@ def test_only_so_many_scans_are_read_and_bad_folders_are_refused(tmp_path: Path)
         measure(tmp_path / "none")
     root = write_set(tmp_path / "set", 2)
     (root / "training/velodyne/000001.bin").write_bytes(b"12345")
-    with pytest.raises(ScanError, match=r"000001\.bin: 5 bytes"):
+    with pytest.raises(ScanError, match=r"000001\.bin: file size \(5 bytes"):
         measure(root)
     (root / "training/label_2/000001.txt").unlink()
     with pytest.raises(DatasetError, match=r"000001\.txt: cannot read the labels"):
