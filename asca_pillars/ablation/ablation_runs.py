@@ -1,7 +1,7 @@
 """The runs of an ablation: trained, evaluated and kept, on equal terms.
 
 Every run is `asca train` with one base configuration and a few overrides, in a process of its own; finished runs are
-kept, so that an interrupted ablation goes on where it stopped.
+kept, so that an interrupted ablation can be resumed.
 """
 
 import json

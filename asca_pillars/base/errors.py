@@ -76,7 +76,7 @@ class WorkerError(AscaError):
 
 
 class TrainingError(AscaError):
-    """A training run that cannot start or must not go on."""
+    """A training run that cannot start or must not continue."""
 
     exit_code = INPUT
 

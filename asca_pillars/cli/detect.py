@@ -165,9 +165,9 @@ def detect(
     A scan that cannot be read is named and left out; the others are detected, and the exit code is 3.
 
     A recording (.mcap, .db3, .bag, a rosbag2 folder, a .pcap of Ouster or Velodyne) is detected scan by scan;
-    OUT/detections.jsonl has a line for each, with its time. After a kill the same command goes on where it was.
+    OUT/detections.jsonl has a line for each, with its time. After a kill the same command resumes.
 
-    With --cluster only OUT/detections.jsonl is written, and the same command goes on where a broken run stopped.
+    With --cluster only OUT/detections.jsonl is written, and the same command resumes a broken run.
 
     Examples:
 

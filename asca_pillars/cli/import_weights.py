@@ -35,7 +35,7 @@ def import_weights(
 
     Every array of the file finds its place, or the command names it and stops. The file is read as data alone, nothing
     in it is executed. What is written is a checkpoint as `asca train` writes it: `asca export` makes a bundle of it,
-    `asca eval` judges it, `asca train --init` goes on from it.
+    `asca eval` judges it, `asca train --init` starts from it.
 
     Examples:
 

@@ -39,7 +39,7 @@ def train(
 ) -> None:
     """Train a detector; checkpoints, TensorBoard logs and the resolved config go to the run's folder.
 
-    After Ctrl-C or a kill the same command goes on exactly where the last checkpoint was written.
+    After Ctrl-C or a kill the same command resumes exactly from the last checkpoint.
 
     Example: asca train asca_small_sim --data data/sim --out runs/small -s train.batch_size=4
     """

@@ -167,7 +167,7 @@ def simulate(
 
     training/{velodyne,label_2,calib}/000000.* and ImageSets/{train,val}.txt; the last `val_share` of the frames is
     for validation. A frame depends on `seed`, `config` and its number alone: any number of workers writes the same
-    bytes. A run that was interrupted, or asked for fewer frames, goes on where it stopped; simulation.json in the
+    bytes. A run that was interrupted, or asked for fewer frames, is resumed; simulation.json in the
     folder tells what it holds.
 
     Args:

@@ -58,7 +58,7 @@ class SaveOnInterrupt(Checkpoint):
         """Take over the signals from Lightning, which has put its handler before ours.
 
         Its handler of SIGTERM broadcasts to the other ranks at once: in the middle of a backward pass, whose gradients
-        they wait for, none of them ever goes on.
+        they wait for, none of them ever continues.
         """
         self._replace_lightnings_handlers()
 
@@ -86,7 +86,9 @@ class SaveOnInterrupt(Checkpoint):
         return trainer.strategy.reduce_boolean_decision(self.stop_requested, all=False)
 
     def _stop(self, trainer: L.Trainer) -> None:
-        raise TrainingInterruptedError(f"interrupted and saved at step {trainer.global_step}; the same command goes on")
+        raise TrainingInterruptedError(
+            f"interrupted and saved at step {trainer.global_step}; run the same command to resume"
+        )
 
 
 class RankProgress(ProgressBar):

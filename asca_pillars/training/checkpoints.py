@@ -1,4 +1,4 @@
-"""A run's checkpoints: written whole, two generations of the last one, and the one to go on from."""
+"""A run's checkpoints: written whole, two generations of the last one, and the one to resume from."""
 
 import contextlib
 import pickle
@@ -116,7 +116,7 @@ def checkpoint_to_resume(folder: Path, model: ModelConfig) -> tuple[Path | None,
         model: of the run.
 
     Raises:
-        TrainingError: there are checkpoints, but none to go on from.
+        TrainingError: there are checkpoints, but none to resume from.
     """
     unusable: list[str] = []
     weights = folder / BEST
@@ -130,7 +130,7 @@ def checkpoint_to_resume(folder: Path, model: ModelConfig) -> tuple[Path | None,
         weights = path if reason == _WEIGHTS_ALONE else weights
     if unusable:
         raise TrainingError(
-            f"{unusable[0]} and there is no {PREVIOUS} to go on from; start a new run in another --out, "
+            f"{unusable[0]} and there is no {PREVIOUS} to resume from; start a new run in another --out, "
             f"with the weights of this one if {weights} is there: --init {weights}"
         )
     return None, None

@@ -25,7 +25,7 @@ MOST_LOOKS = 180
 """Looks without a batch after which it gives up: a quarter of an hour, in which the run was not suspended."""
 _REMEDY = (
     "lower data.workers or set data.workers=0, or give a container more memory (--memory, --shm-size); the same "
-    "command goes on from the last checkpoint"
+    "command resumes from the last checkpoint"
 )
 
 

@@ -56,7 +56,7 @@ def train(
     bar: ProgressBar | None = None,
     reporter: Reporter | None = None,
 ) -> Path:
-    """Train `config` on a dataset, or go on where an interrupted run in `out` stopped.
+    """Train `config` on a dataset, or resume an interrupted run in `out`.
 
     `out` receives config.yaml (resolved), environment.json, frames.json, expected_input.yaml, TensorBoard logs and
     checkpoints/{last,previous,best,weights}.ckpt.
@@ -70,7 +70,7 @@ def train(
             that has no checkpoint yet gives way.
         devices: number of devices on this machine, or `auto`.
         num_nodes: machines that train together, each started with the same command (torchrun, SLURM).
-        init: checkpoint that a new run starts from, see `initial_weights`; a run that goes on must have started from
+        init: checkpoint that a new run starts from, see `initial_weights`; a resumed run must have started from
             them.
         bar: shows the steps and validations of the run; None: the reporter is told of them.
         reporter: told of what comes before, and of what is odd about the run; None for none.
@@ -133,9 +133,9 @@ def _train(
     inputs = TrainingInputs.of(data.training_set.frames.split, trainer.world_size, weights)
     claim_run_folder(out, config, inputs, steps_of(resumed))
     if damage is not None and goes_on:
-        reporter.remark(f"{damage}: going on from {resumed}")
+        reporter.remark(f"{damage}: resuming from {resumed}")
     if config.train.precision == "bf16" and not has_bfloat16():
-        remedy = f"go on where {out} was started, or anew with --init" if goes_on else "choose auto or fp32"
+        remedy = f"resume where {out} was started, or start anew with --init" if goes_on else "choose auto or fp32"
         reporter.remark(f"train.precision = bf16: this device has no bfloat16 and is many times slower in it; {remedy}")
     L.seed_everything(config.train.seed, verbose=False)
     keep = goes_on or not trainer.is_global_zero  # else it may be of scans that were there before

@@ -104,7 +104,7 @@ class DetectionModule(L.LightningModule):
         """Return the optimizer steps of one epoch.
 
         Not Lightning's `estimated_stepping_batches`: that opens the loader before a checkpoint has told the step at
-        which the sampler is to go on.
+        which the sampler is to resume.
         """
         frames = len(self.trainer.datamodule.training_set)  # type: ignore[attr-defined]
         return steps_per_epoch(self.config.train, frames, self.trainer.world_size)

@@ -174,7 +174,7 @@ def _other_inputs_reason(path: Path, found: TrainingInputs, inputs: TrainingInpu
     if None not in (found.initial_sha256, inputs.initial_sha256) and found.initial_sha256 != inputs.initial_sha256:
         return (
             f"{path}: the run there was started from {'other' if found.initial_sha256 else 'random'} weights; leave "
-            "--init out to go on with it, or start a new run in another --out"
+            "--init out to resume it, or start a new run in another --out"
         )
     return None
 

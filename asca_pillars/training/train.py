@@ -25,7 +25,7 @@ def train(
     remark: Remark | None = None,
     bar: "ProgressBar | None" = None,
 ) -> Path:
-    """Train a detector, or go on where an interrupted run in `out` stopped.
+    """Train a detector, or resume an interrupted run in `out`.
 
     Args:
         config: YAML, the name of one that ships, or what `load_config` read.

@@ -297,7 +297,7 @@ def test_after_sigkill(drive: Path, calib: Path, undisturbed: Path, tmp_path: Pa
     killed = subprocess.run([sys.executable, "-c", KILLS_ITSELF, *map(str, given)], stdout=subprocess.DEVNULL)
     assert killed.returncode == -signal.SIGKILL and not (tmp_path / "detections.jsonl").exists()
     resumed = run_here(*given)
-    assert resumed.returncode == 0 and "going on after the" in resumed.stdout
+    assert resumed.returncode == 0 and "resuming after the" in resumed.stdout
     assert outputs(tmp_path) == outputs(undisturbed)
 
 

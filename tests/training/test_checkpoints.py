@@ -1,4 +1,4 @@
-"""Checkpoints of a run: two generations, the one to go on from, and weights that a new run starts from."""
+"""Checkpoints of a run: two generations, the one to resume from, and weights that a new run starts from."""
 
 import dataclasses
 import signal

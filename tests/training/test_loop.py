@@ -163,7 +163,7 @@ def test_who_asks_it_to_stop_is_told_how_to_go_on(
 
     monkeypatch.setattr(DetectionModule, "training_step", interrupted)
     before = signal.getsignal(number)
-    with pytest.raises(TrainingInterruptedError, match="saved at step 2; the same command goes on"):
+    with pytest.raises(TrainingInterruptedError, match="saved at step 2; run the same command to resume"):
         train(config, data, tmp_path / "run")
     assert signal.getsignal(number) is before
     checkpoints = tmp_path / "run" / "checkpoints"

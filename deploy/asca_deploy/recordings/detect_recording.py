@@ -189,7 +189,7 @@ def _detect(task: _Task, reading: ScanSettings, options: RuntimeOptions, reporte
     about = _about(task, reading, mounting, detector, topic.name, least, around=around)
     with Journal(task.out, about, detector.spec.class_names) as journal:
         if journal.done:
-            reporter.remark(f"going on after the {journal.done} scans that {journal.path} holds")
+            reporter.remark(f"resuming after the {journal.done} scans that {journal.path} holds")
         if journal.differs:
             reporter.remark(f"beginning anew: another run was killed here, with another {journal.differs}")
         start = process_time()
