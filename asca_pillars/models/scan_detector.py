@@ -15,7 +15,7 @@ from asca_pillars.detection.detections import Detections
 from asca_pillars.detection.spec import DetectorSpec
 from asca_pillars.geometry.frame_change import FrameChange
 from asca_pillars.models.checkpoint import load_checkpoint
-from asca_pillars.models.trainable import Trainable
+from asca_pillars.models.trainable import Trainable, to_device
 from asca_pillars.scans.mounting import Mounting
 
 
@@ -40,7 +40,7 @@ class ScanDetector:
             points = self._to_model.points(points)
         unlabeled = LabeledFrame("", points, np.empty((0, 7), np.float32), np.empty(0, np.int64))
         preparation = self.network.preparation
-        batch = preparation.collate([preparation.prepare(unlabeled, None)]).to(self._device)
+        batch = to_device(preparation.collate([preparation.prepare(unlabeled, None)]), self._device)
         with torch.inference_mode():
             found = self.network.detect(self.network.predict(batch), self.spec)[0]
         if self._to_model is not None:

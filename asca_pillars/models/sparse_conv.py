@@ -36,6 +36,7 @@ def linear_rows(features: Tensor, weight: Tensor, bias: Tensor | None = None) ->
 
 
 CHUNK_VALUES = 1 << 20  # gathered at a time: on a CPU they stay in its cache; all at once would be memory-bound
+GPU_CHUNK_VALUES = 1 << 28  # half a GiB in bfloat16; there each chunk costs launches
 
 
 def rulebook_conv(features: Tensor, weight: Tensor, table: Tensor, back: Tensor | None = None) -> Tensor:
@@ -105,7 +106,8 @@ def _chunks(features: Tensor, table: Tensor) -> Iterator[tuple[int, Tensor]]:
     """Yield for each chunk its number of rows, and its gathered rows (m, K * C), followed by zeros."""
     padded = F.pad(features, (0, 0, 0, 1))
     values = table.shape[1] * features.shape[1]
-    for part in table.split(rounded_rows(max(CHUNK_VALUES // values, 1))):
+    at_once = GPU_CHUNK_VALUES if features.is_cuda else CHUNK_VALUES
+    for part in table.split(rounded_rows(max(at_once // values, 1))):
         entries = pad_rows(part, len(features))
         yield len(part), padded.index_select(0, entries.flatten()).view(len(entries), values)
 

@@ -2,22 +2,25 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import Any, Protocol, Self
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
+import torch
 from torch import Tensor, nn
+from torch.utils._pytree import tree_map_only
 
 from asca_pillars.data.frames import LabeledFrame
 from asca_pillars.detection.detections import Detections
 from asca_pillars.detection.spec import DetectorSpec
 
+BatchT = TypeVar("BatchT")
 
-class Movable(Protocol):
-    """A batch of tensors that can move to a device."""
 
-    def to(self, device: Any) -> Self:
-        """Return the batch with its tensors on `device`."""
-        ...
+def to_device(batch: BatchT, device: str | torch.device) -> BatchT:
+    """Return a batch with its tensors on `device`; a GPU copies pinned ones while the host goes on."""
+    non_blocking = torch.device(device).type == "cuda"
+    moved: BatchT = tree_map_only(Tensor, lambda tensor: tensor.to(device, non_blocking=non_blocking), batch)
+    return moved
 
 
 class Preparation(Protocol):
@@ -32,8 +35,8 @@ class Preparation(Protocol):
         """
         ...
 
-    def collate(self, frames: Sequence[Any]) -> Movable:
-        """Collate the results of `prepare` for B frames into one batch of tensors."""
+    def collate(self, frames: Sequence[Any]) -> Any:
+        """Collate the results of `prepare` for B frames into one batch: tensors in NamedTuples, to any depth."""
         ...
 
 

@@ -6,6 +6,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from torch import Tensor
+from torch.utils._pytree import tree_map_only
 from torch.utils.data import Dataset
 
 from asca_pillars.base.errors import AscaError, WorkerError
@@ -14,7 +16,7 @@ from asca_pillars.config.tree import Config
 from asca_pillars.data.frames import LabeledFrame, within_ranges
 from asca_pillars.data.training_frames import TrainingFrames, open_frames
 from asca_pillars.models.build import build_preparation
-from asca_pillars.models.trainable import Movable, Preparation
+from asca_pillars.models.trainable import Preparation, to_device
 
 
 @dataclass(frozen=True)
@@ -39,11 +41,16 @@ class Batch:
     frame_ids: list[str]
     boxes: list[np.ndarray]
     labels: list[np.ndarray]
-    inputs: Movable
+    inputs: Any
 
     def to(self, device: Any) -> "Batch":
         """Move the tensors, in place, as Lightning expects of a batch."""
-        self.inputs = self.inputs.to(device)
+        self.inputs = to_device(self.inputs, device)
+        return self
+
+    def pin_memory(self) -> "Batch":
+        """Pin the tensors, in place, as `DataLoader` expects of a batch."""
+        self.inputs = tree_map_only(Tensor, Tensor.pin_memory, self.inputs)
         return self
 
 

@@ -101,7 +101,7 @@ class ShareCollated:
         try:
             batch = self.collate(samples)
             if isinstance(batch, Batch) and hasattr(os, "memfd_create"):
-                batch.inputs = SharedInputs(batch.inputs)  # type: ignore[assignment]  # unpickled it is the inputs
+                batch.inputs = SharedInputs(batch.inputs)  # unpickled it is the inputs
         except (OSError, MemoryError) as error:
             return WorkerError(
                 f"no room for a batch of {len(samples)} frames ({error or type(error).__name__}); "

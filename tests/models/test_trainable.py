@@ -13,7 +13,7 @@ from asca_pillars.config.tree import Config
 from asca_pillars.detection.spec import DetectorSpec
 from asca_pillars.models.build import build_model
 from asca_pillars.models.scan_detector import ScanDetector
-from asca_pillars.models.trainable import Movable, Trainable
+from asca_pillars.models.trainable import Trainable, to_device
 from asca_pillars.training.dataset import Batch, Collate, open_dataset
 from tests.helpers.scenes import SPEC, write_dataset
 from tests.helpers.second_device import SecondDevice, move_weights, on_gpu
@@ -27,11 +27,11 @@ PILLARS: dict[str, dict[str, Any]] = {
 }
 
 
-def learns_and_detects(detector: Trainable, inputs: Movable, spec: DetectorSpec) -> None:
+def learns_and_detects(detector: Trainable, inputs: Any, spec: DetectorSpec) -> None:
     assert isinstance(detector, torch.nn.Module)
     move_weights(detector)
     with SecondDevice():
-        there = inputs.to("cuda")
+        there = to_device(inputs, "cuda")
         detector.train()
         terms = detector.loss(detector.predict(there), there)
         assert all(map(on_gpu, terms.values()))
@@ -42,7 +42,7 @@ def learns_and_detects(detector: Trainable, inputs: Movable, spec: DetectorSpec)
         assert len(detector.detect(detector.predict(there), spec)) == 2
 
 
-def drawn(config: Config, root: Path) -> Movable:
+def drawn(config: Config, root: Path) -> Any:
     frames = open_dataset(root, config, training=True)
     found = Collate(frames.preparation)([frames.sample(0, 0), frames.sample(0, 1)])
     assert isinstance(found, Batch)
@@ -89,6 +89,6 @@ def test_what_stays_on_the_cpu_is_refused() -> None:
             with pytest.raises(RuntimeError, match="on the"):
                 refused()
         detector = tiny_detector()
-        inputs = batch(detector, frame(0), frame(1)).to("cuda")
+        inputs = to_device(batch(detector, frame(0), frame(1)), "cuda")
         with pytest.raises(RuntimeError, match="on the CPU"):
             detector.predict(inputs)  # its weights are still there

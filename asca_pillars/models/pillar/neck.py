@@ -55,19 +55,6 @@ class SparseRPNNeck(MapBackbone):
             maps.append(_upsampled(deblock, pillars, level.places))
         return torch.cat(maps, dim=1)
 
-    def forward_dense(self, canvas: Tensor, rulebooks: NeckRulebooks[Tensor]) -> Tensor:
-        """Compute `forward` by dense convolutions with masks: pseudo-image (B, C, ny, nx) -> (M, out_channels)."""
-        maps = []
-        for block, deblock, level in zip(self.blocks, self.deblocks, rulebooks.levels, strict=True):
-            for number, (convolution, norm) in enumerate(block_layers(block)):
-                everywhere = convolution(canvas).permute(0, 2, 3, 1)  # (B, h, w, outputs)
-                cells = (level.cells if number else level.strided_cells).long()
-                active = torch.relu(at_active_cells(norm, everywhere.flatten(0, 2)[cells]))
-                masked = active.new_zeros(everywhere.shape).flatten(0, 2).index_put((cells,), active)
-                canvas = masked.view(everywhere.shape).permute(0, 3, 1, 2)
-            maps.append(_upsampled(deblock, active, level.places))
-        return torch.cat(maps, dim=1)
-
 
 def block_layers(block: nn.Module) -> Iterator[tuple[Any, Any]]:
     """Return each convolution of a block with the normalization that follows it."""

@@ -80,12 +80,9 @@ class PillarDetector(Trainable):
             batch.features, batch.pillar_index, batch.point_counts, batch.frame_pillars
         )  # (P, C)
         features, cells, frame_cells = self.pool(pillar_features, batch)
-        if batch.neck is not None and not features.is_cuda:
+        if batch.neck is not None:
             return self.neck(features, batch.neck)  # type: ignore[no-any-return]
         canvas = self.scatter(features, cells, frame_cells)  # (B, C, rows, columns)
-        if batch.neck is not None:  # where a dense convolution costs less than gathering
-            assert isinstance(self.neck, SparseRPNNeck)
-            return self.neck.forward_dense(canvas, batch.neck)
         return self.neck(canvas)  # type: ignore[no-any-return]
 
     def read_head(self, features: Tensor, batch: PillarBatch) -> HeadMaps[Tensor]:

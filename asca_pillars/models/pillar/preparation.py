@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -69,11 +69,6 @@ class LabeledPillars(NamedTuple):
 
     pillars: PillarBatch
     targets: TargetBatch
-
-    def to(self, device: Any) -> "LabeledPillars":
-        """Return the batch with its tensors on `device`."""
-        moved: LabeledPillars = tree_map_only(Tensor, lambda tensor: tensor.to(device), self)
-        return moved
 
 
 @dataclass(frozen=True)

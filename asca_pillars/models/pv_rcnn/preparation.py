@@ -67,11 +67,6 @@ class LabeledVoxels(NamedTuple):
     labels: tuple[NDArray[np.int64], ...]
     """(M,) per frame, or IGNORED."""
 
-    def to(self, device: Any) -> "LabeledVoxels":
-        """Return the batch with its tensors on `device`."""
-        moved: LabeledVoxels = tree_map_only(Tensor, lambda tensor: tensor.to(device), self)
-        return moved
-
 
 def batch_scans(scans: Sequence[VoxelScan], spec: VoxelSpec) -> VoxelBatch[Tensor]:
     """Batch several scans, at least one."""

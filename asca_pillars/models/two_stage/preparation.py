@@ -2,13 +2,12 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
-from torch.utils._pytree import tree_map_only
 
 from asca_pillars.base.progress import SILENT, Reporter
 from asca_pillars.config.tree import DataConfig
@@ -136,11 +135,6 @@ class LabeledProposals(NamedTuple):
     """(R,) bool, the proposals that the loss counts."""
     proposals: tuple[Detections, ...]
     """Proposals of each frame."""
-
-    def to(self, device: Any) -> "LabeledProposals":
-        """Return the batch with its tensors on `device`."""
-        moved: LabeledProposals = tree_map_only(Tensor, lambda tensor: tensor.to(device), self)
-        return moved
 
 
 class ProposalSource(Protocol):

@@ -8,13 +8,15 @@ from typing import Literal
 import numpy as np
 import pytest
 import torch
+from torch import nn
 
 from asca_pillars.base.errors import ConfigError
 from asca_pillars.config.pillar import LossConfig, NetworkConfig, PillarModel
 from asca_pillars.models.pillar.loss import TargetBatch, detection_loss
-from asca_pillars.models.pillar.neck import RPNNeck, SparseRPNNeck
+from asca_pillars.models.pillar.neck import RPNNeck, SparseRPNNeck, block_layers
 from asca_pillars.models.pillar.network import PillarDetector, PillarOutputs, build_pillar_detector
 from asca_pillars.models.pillar.preparation import LabeledPillars, PillarBatch, Placement, batch_pillars
+from asca_pillars.models.sparse_conv import at_active_cells
 from asca_pillars.ops.pillar.neck_rulebooks import MaskRule, NeckRulebookBuilder
 from tests.helpers.scenes import SPEC, make_scene
 from tests.models.pillar.loss_scenes import batched, scene_targets
@@ -42,8 +44,30 @@ def dense_rows(detector: PillarDetector, batch: PillarBatch) -> torch.Tensor:
     """The sparse neck's output, computed on whole maps."""
     features = detector.encode(batch.features, batch.pillar_index, batch.point_counts, batch.frame_pillars)
     canvas = detector.scatter(features, batch.cells, batch.frame_pillars)
-    assert isinstance(detector.neck, SparseRPNNeck) and batch.neck is not None
-    return detector.neck.forward_dense(canvas, batch.neck)
+    neck, rulebooks = detector.neck, batch.neck
+    assert isinstance(neck, SparseRPNNeck) and rulebooks is not None
+    maps = []
+    for block, deblock, level in zip(neck.blocks, neck.deblocks, rulebooks.levels, strict=True):
+        for number, (convolution, norm) in enumerate(block_layers(block)):
+            cells = (level.cells if number else level.strided_cells).long()
+            canvas, mask = masked(norm, convolution(canvas), cells)
+        transposed, norm, _ = deblock.children()
+        assert isinstance(transposed, nn.ConvTranspose2d)
+        cells = nn.functional.interpolate(mask, scale_factor=transposed.stride).flatten().nonzero()[:, 0]
+        everywhere, _ = masked(norm, transposed(canvas), cells)
+        maps.append(everywhere.permute(0, 2, 3, 1).flatten(0, 2)[rulebooks.head_cells.long()])
+    return torch.cat(maps, dim=1)
+
+
+def masked(norm: nn.Module, canvas: torch.Tensor, cells: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Maps (B, C, h, w), normalized and rectified at these cells and zero elsewhere, and the mask (B, 1, h, w)."""
+    rows = canvas.permute(0, 2, 3, 1).flatten(0, 2)
+    active = torch.relu(at_active_cells(norm, rows[cells]))
+    everywhere = torch.zeros_like(rows).index_put((cells,), active)
+    mask = torch.zeros_like(rows[:, :1]).index_put((cells,), torch.ones_like(rows[cells, :1]))
+    frames, _, height, width = canvas.shape
+    maps = (part.view(frames, height, width, -1).permute(0, 3, 1, 2) for part in (everywhere, mask))
+    return next(maps), next(maps)
 
 
 @pytest.mark.parametrize("rule", RULES)
