@@ -210,6 +210,14 @@ def test_batches_keep_frames_apart(tmp_path: Path, order: tuple[int, ...]) -> No
     assert types == [torch.float32, torch.int64, torch.int64, torch.int8, torch.int64]
 
 
+def test_a_batch_is_pinned_as_a_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.Tensor, "pin_memory", lambda tensor: tensor.to("meta"))  # a CPU alone has none
+    frames = open_dataset(write_dataset(tmp_path, 3), CONFIG, training=True)
+    batch = Collate(frames.preparation)([frames.sample(0, 0)])
+    assert isinstance(batch, Batch) and batch.pin_memory() is batch
+    assert {each.device.type for each in tree_leaves(batch.inputs) if isinstance(each, torch.Tensor)} == {"meta"}
+
+
 def test_a_batch_moves_as_a_whole_with_the_tables_of_a_sparse_neck(tmp_path: Path) -> None:
     model = PillarModel(spec=SPEC, network=NetworkConfig(neck="sparse"))
     frames = open_dataset(write_dataset(tmp_path, 3), dataclasses.replace(CONFIG, model=model), training=True)
