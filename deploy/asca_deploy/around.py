@@ -42,7 +42,7 @@ def widen_ranges(bundle: Bundle) -> Bundle:
     """Return the bundle with ranges widened in every direction to its farthest reach, where its graphs allow it.
 
     That requires a sparse neck, which reads rulebooks instead of a map, pillars of one size, and weights trained on
-    whole revolutions. Other bundles are returned unchanged. `max_pillars` grows with the area.
+    whole revolutions. Other bundles are returned unchanged.
     """
     if not isinstance(bundle, PillarBundle) or bundle.pillar.neck == "dense" or bundle.expected_input.camera_view:
         return bundle
@@ -51,10 +51,7 @@ def widen_ranges(bundle: Bundle) -> Bundle:
         return bundle
     reach = max(abs(end) for end in (*grid.x_range_m, *grid.y_range_m))
     x_end, y_end = (_fitting_range(reach, pillar_m) for pillar_m in (grid.v_max_m, grid.v_y_m))
-    square = replace(grid, x_range_m=(-x_end, x_end), y_range_m=(-y_end, y_end))
-    share = math.prod(square.map_shape) / math.prod(grid.map_shape)
-    limits = replace(spec.limits, max_pillars=math.ceil(spec.limits.max_pillars * share))
-    return replace(bundle, spec=replace(spec, grid=square, limits=limits))
+    return replace(bundle, spec=spec.with_ranges((-x_end, x_end), (-y_end, y_end)))
 
 
 def _fitting_range(reach_m: float, pillar_m: float) -> float:

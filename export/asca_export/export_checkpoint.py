@@ -17,6 +17,7 @@ from asca_pillars.base.extras import require
 from asca_pillars.base.own_files import require_not_input, require_replaceable
 from asca_pillars.base.progress import Progress, Reporter
 from asca_pillars.base.settings import with_overrides
+from asca_pillars.config.pillar import PillarModel
 from asca_pillars.detection.decode import PostProcess
 from asca_pillars.detection.spec import DetectorSpec, ScoreThresholds
 from asca_pillars.ops.pillar.spec import PillarSpec
@@ -24,6 +25,7 @@ from asca_pillars.scans.find_scans import find_scans
 from asca_pillars.scans.scan_reader import read_scan
 
 if TYPE_CHECKING:
+    from asca_pillars.config.tree import ModelConfig
     from asca_pillars.models.checkpoint import Checkpoint
 
 PARITY_SCANS, PARITY_SEED = 8, 2**31  # seeds far from those that people train with
@@ -105,7 +107,7 @@ def export(
     if post:
         spec = replace(spec, post=with_overrides(spec.post, post, f"--post {' --post '.join(post)}"))
     if range_m is not None:
-        spec = with_ranges(spec, range_m)
+        spec = with_ranges(loaded.config.model, spec, range_m)
     model = replace(loaded.config.model, spec=spec)  # type: ignore[arg-type]  # of the same kind
     loaded = loaded.with_model(model)
     if calibrate is not None and not int8:
@@ -154,8 +156,8 @@ def open_source(source: Path) -> Source:
     return Source(path, checkpoint, scores, bundle.spec.post, bundle.provenance.trained_on, bundle.provenance.command)
 
 
-def with_ranges(spec: DetectorSpec, range_m: tuple[float, float, float, float]) -> PillarSpec:
-    """Return the same detector with other ranges: from x0 to x1 and from y0 to y1, metres, LiDAR frame.
+def with_ranges(model: "ModelConfig", spec: DetectorSpec, range_m: tuple[float, float, float, float]) -> PillarSpec:
+    """Return the spec of the same detector with other ranges: from x0 to x1 and from y0 to y1, metres, LiDAR frame.
 
     Raises:
         ConfigError: it is not a pillar detector, or pillars do not fill these ranges; the nearest that fit are named.
@@ -163,7 +165,10 @@ def with_ranges(spec: DetectorSpec, range_m: tuple[float, float, float, float]) 
     if not isinstance(spec, PillarSpec):
         raise ConfigError("--range: only detectors on pillars look elsewhere with the same weights; leave it out")
     x0, x1, y0, y1 = range_m
-    return replace(spec, grid=replace(spec.grid, x_range_m=(x0, x1), y_range_m=(y0, y1)))
+    found = spec.with_ranges((x0, x1), (y0, y1))
+    if isinstance(model, PillarModel) and model.network.cpa == "paper":  # its weights are laid out for so many pillars
+        return replace(found, limits=spec.limits)
+    return found
 
 
 def read_or_simulate(

@@ -1,6 +1,7 @@
 """Spec of a pillar detector, shared by training, export and runtime; stored in `bundle.json`."""
 
-from dataclasses import dataclass, field
+import math
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -34,6 +35,17 @@ class PillarSpec(DetectorSpec):
     def ranges(self) -> Ranges:
         """Detection ranges."""
         return self.grid.ranges
+
+    def with_ranges(self, x_range_m: tuple[float, float], y_range_m: tuple[float, float]) -> "PillarSpec":
+        """Return the spec with other ranges, metres, LiDAR frame; `max_pillars` grows with the area.
+
+        Raises:
+            ConfigError: pillars do not fill these ranges.
+        """
+        grid = replace(self.grid, x_range_m=x_range_m, y_range_m=y_range_m)
+        growth = max(math.prod(grid.map_shape) / math.prod(self.grid.map_shape), 1.0)
+        limits = replace(self.limits, max_pillars=math.ceil(self.limits.max_pillars * growth))
+        return replace(self, grid=grid, limits=limits)
 
     def head_centers_m(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return centers of the head map's cells in metres, LiDAR frame: x of its columns (W,), y of its rows (H,)."""

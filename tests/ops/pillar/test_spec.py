@@ -50,6 +50,13 @@ def test_anchors_are_made_once_and_thresholds_set_for_all_or_by_name() -> None:
         SPEC.with_score_threshold({"Car": 2.0})
 
 
+def test_the_limit_of_pillars_grows_with_the_ranges() -> None:
+    around = SPEC.with_ranges((-15.36, 15.36), (-10.24, 10.24))
+    assert around.grid.x_range_m == (-15.36, 15.36) and around.grid.y_range_m == (-10.24, 10.24)
+    assert around.limits == PillarLimits(max_pillars=80, max_points=2), "four times the area"
+    assert SPEC.with_ranges((2.0, 9.68), (-3.2, 7.04)).limits == SPEC.limits, "near cells are full more often"
+
+
 def test_impossible_directions_and_classes_are_refused() -> None:
     assert PillarSpec(direction_offset_rad=-np.pi).direction_offset_rad == -np.pi
     with pytest.raises(ConfigError, match="direction_offset_rad -90 must lie between -pi and pi; it is in radians"):
