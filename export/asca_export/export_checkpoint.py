@@ -70,7 +70,7 @@ def export(
 
     Args:
         checkpoint: of a run, or a bundle (folder, or name of one that ships) that holds its weights.
-        out: folder of the bundle; an earlier bundle there is replaced.
+        out: folder of the bundle, which gets its name; an earlier bundle there is replaced.
         scans: like those trained on, to compare on; None: simulated ones.
         trained_on: training data in words, for the manifest; None: from the bundle that holds the weights.
         score: thresholds of the bundle; None: those of the checkpoint.
@@ -110,6 +110,7 @@ def export(
         spec = with_ranges(loaded.config.model, spec, range_m)
     model = replace(loaded.config.model, spec=spec)  # type: ignore[arg-type]  # of the same kind
     loaded = loaded.with_model(model)
+    loaded = loaded._replace(config=replace(loaded.config, name=out.resolve().name))
     if calibrate is not None and not int8:
         raise ConfigError(f"--calibrate {calibrate} without --int8: only an 8-bit bundle is calibrated; add --int8")
     require_not_input(out, (getattr(model, "first_stage", None),))

@@ -146,13 +146,13 @@ def write_quantized(
 
     Args:
         folder: with all graphs.
-        bundle: the float bundle's manifest, in whatever the graphs have changed but name, precision and report.
+        bundle: the float bundle's manifest, in whatever the graphs have changed but precision and report.
         report: without boxes.
         expected: what the float bundle finds on the scans.
         scans: (N, 4) each, LiDAR frame, that both are compared on.
     """
     report = replace(report, boxes=sum(map(len, expected)))
-    draft = replace(bundle, name=f"{bundle.name}_int8", precision="int8", quantization=report)
+    draft = replace(bundle, precision="int8", quantization=report)
     draft = graphs.sign(folder, draft)
     write_bundle_manifest(folder, draft)
     quantized = replace(draft, quantization=_with_boxes(report, expected, list(map(Detector(folder), scans))))

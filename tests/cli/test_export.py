@@ -75,6 +75,7 @@ def test_the_same_weights_look_elsewhere(scans: Path, tmp_path: Path) -> None:
         invoke("export", tmp_path / "last.ckpt", "-o", tmp_path / name, *ranges, *tail)
     ahead, around = (Detector(tmp_path / name) for name in ("ahead", "around"))
     assert around.spec.ranges.x_m == (-20.16, 29.76)
+    assert load_pillar_bundle(tmp_path / "around").name == "around", "the folder's"
     points = SCANS[0][SCANS[0][:, 0] >= 4.8]
     narrow, wide = ahead(points).boxes, around(points).boxes
     assert len(narrow) > 3 and _all_in(narrow[narrow[:, 0] > 8], wide) and _all_in(wide[wide[:, 0] > 8], narrow)

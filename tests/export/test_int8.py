@@ -54,7 +54,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_the_bundle_says_what_it_is(folder: Path) -> None:
     bundle = load_pillar_bundle(folder)
-    assert (bundle.name, bundle.precision, bundle.pillar.canvas.type) == ("tiny_int8", "int8", "uint8")
+    assert (bundle.name, bundle.precision, bundle.pillar.canvas.type) == ("tiny", "int8", "uint8")
     assert len(bundle.pillar.canvas.empty) == bundle.pillar.channels
     assert any(bundle.pillar.canvas.empty), "attention makes features negative, so zero is not the lowest step"
     report = bundle.quantization

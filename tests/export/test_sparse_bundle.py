@@ -42,7 +42,7 @@ def test_golden_vectors_hold_the_tables(exported: Callable[[str], Path], rule: s
 
 def test_eight_bits_report_how_near_they_are(int8_bundle: Path) -> None:
     bundle = load_pillar_bundle(int8_bundle)
-    assert (bundle.name, bundle.precision, bundle.pillar.canvas.type) == ("tiny_int8", "int8", "uint8")
+    assert (bundle.name, bundle.precision, bundle.pillar.canvas.type) == ("tiny", "int8", "uint8")
     report = bundle.quantization
     assert report is not None and len(report.layers) == 6 + 3 + 1
     assert 0 < report.logit_rms_error <= 0.08 and not any(layer.kept_float for layer in report.layers)
@@ -73,7 +73,7 @@ def test_reports_name_the_stages_of_this_pipeline(int8_bundle: Path) -> None:
 @pytest.mark.parametrize("provider", ["openvino", "tensorrt"])
 def test_a_provider_that_cannot_run_it_says_why(int8_bundle: Path, provider: Any) -> None:
     bundle = load_pillar_bundle(int8_bundle)
-    with pytest.raises(ProviderError, match=f"{provider} cannot run the sparse neck of tiny_int8: .*provider cpu"):
+    with pytest.raises(ProviderError, match=f"{provider} cannot run the sparse neck of tiny: .*provider cpu"):
         open_backbone(int8_bundle / "backbone.onnx", bundle, provider, "float32", 1)
 
 

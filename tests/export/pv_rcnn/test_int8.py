@@ -68,7 +68,7 @@ def opened(folder: Path) -> tuple[Detector, PvRcnnPipeline]:
 def test_the_bundle_says_what_it_is(folders: tuple[Path, Path]) -> None:
     bundle = load_bundle(folders[1])
     assert isinstance(bundle, PvRcnnBundle)
-    assert (bundle.name, bundle.precision) == ("tiny_pv_rcnn_int8", "int8")
+    assert (bundle.name, bundle.precision) == ("tiny_pv_rcnn", "int8")
     report = bundle.quantization
     assert report is not None and bundle.parity is not None
     assert (report.calibration_scans, report.dropped_scans, report.compared_scans) == (8, 2, 4)

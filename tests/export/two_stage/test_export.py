@@ -100,7 +100,7 @@ def test_the_first_stage_in_eight_bits(
         checkpoint, tmp_path / "a", SCANS, ExportOptions(calibration=CALIBRATION, weights=trained[0])
     )
     assert load_checkpoint(tmp_path / "a" / "weights.ckpt").config == checkpoint.config
-    assert (quantized.name, quantized.precision, quantized.kind) == ("tiny_refine_int8", "int8", "pillar_refine")
+    assert (quantized.name, quantized.precision, quantized.kind) == ("tiny_refine", "int8", "pillar_refine")
     assert load_pillar_bundle(tmp_path / "a") == quantized
     report = quantized.quantization
     assert report is not None and report.boxes > 5 and report.boxes_matched > report.boxes / 2
