@@ -98,7 +98,11 @@ def _match_by_overlap(
     box_rows: NDArray[np.int64],
 ) -> _Matches:
     shape = anchors.shape[:3]
-    best_iou, best_box = np.zeros(shape), np.full(shape, -1)
+    # Touched in the windows around boxes alone: a map all around has a million anchors.
+    best_iou, best_box = np.zeros(shape), np.empty(shape, np.int64)
+    state = np.empty(shape, np.int8)
+    state[:] = np.repeat([-(spec.negative_iou == 0) for spec in classes], len(ANCHOR_YAWS_RAD))
+    windows: list[tuple[tuple[slice, slice, slice], ClassSpec]] = []
     forced: list[tuple[NDArray[np.int64], int]] = []
     for box_index in box_rows:
         label = labels[box_index]
@@ -109,12 +113,10 @@ def _match_by_overlap(
         if iou.size and iou.max() > 0:
             offset = [part.start for part in window]
             forced.append((np.argwhere(iou == iou.max()) + offset, box_index))
-    positive_iou, negative_iou = (
-        np.repeat([getattr(spec, name) for spec in classes], len(ANCHOR_YAWS_RAD))
-        for name in ("positive_iou", "negative_iou")
-    )
-    state = -(best_iou >= negative_iou).astype(np.int8)
-    state[best_iou >= positive_iou] = 1
+        windows.append((window, classes[label]))
+    for window, spec in windows:
+        best = best_iou[window]
+        state[window] = np.where(best >= spec.positive_iou, 1, -(best >= spec.negative_iou).astype(np.int8))
     for places, box_index in forced:
         state[tuple(places.T)] = 1
         best_box[tuple(places.T)] = box_index
