@@ -20,7 +20,9 @@ def polygon(box: np.ndarray) -> shapely.Polygon:
 def intersection_twin(a: np.ndarray, b: np.ndarray) -> float:
     a, b = a.astype(np.float64), b.astype(np.float64)
     # About the origin: at 70 m shapely's own rounding would be larger than ours.
-    return float(polygon(moved(a, *-a[:2])).intersection(polygon(moved(b, *-a[:2]))).area)
+    shared = polygon(moved(a, *-a[:2])).intersection(polygon(moved(b, *-a[:2]))).area
+    # GEOS gives 0.00163 m2 for two plates of 1 mm x 1.6 m that differ by one rounding.
+    return float(min(shared, a[3] * a[4], b[3] * b[4]))
 
 
 def bev_iou_twin(a: np.ndarray, b: np.ndarray) -> float:
