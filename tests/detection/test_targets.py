@@ -1,5 +1,6 @@
 """Both assignments of targets against plain loops over all anchors, and by hand."""
 
+import dataclasses
 import math
 import statistics
 from collections.abc import Callable
@@ -179,3 +180,12 @@ def test_no_boxes(assigner: Assigner) -> None:
     assert shapes == [(0,), (0, 7), (0, 7), (0,)]
     kinds = (targets.positives, targets.anchors, targets.residuals, targets.directions, targets.matched)
     assert [part.dtype for part in kinds] == [np.int64, np.float32, np.float32, np.int64, np.int64]
+
+
+def test_without_background_every_other_anchor_is_ignored() -> None:
+    classes = [dataclasses.replace(KITTI_CLASSES[CAR], negative_iou=0.0), *KITTI_CLASSES[1:]]
+    box = np.array([[4.0, 4.0, -1.0, 3.9, 1.6, 1.56, 0.0]], np.float32)
+    for boxes, labels in ((box, np.array([CAR])), (box[:0], np.empty(0, np.int64))):
+        state = assign_targets(SQUARE, classes, boxes, labels).state
+        assert ((state[..., :2] == 1).any(), (state[..., :2] == 0).any()) == (len(boxes) > 0, False)
+        assert (state[..., 2:] == 0).all(), "the other classes have background"
