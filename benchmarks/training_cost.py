@@ -23,6 +23,7 @@ from asca_pillars.cli.run_command import run_command
 from asca_pillars.config.tree import load_config
 from asca_pillars.evaluation.report_page import markdown_table
 from asca_pillars.models.build import build_model
+from asca_pillars.models.trainable import to_device
 from asca_pillars.training.dataset import open_dataset
 from asca_pillars.training.module import resolve_precision
 
@@ -51,7 +52,7 @@ def main(
         inputs = frames.preparation.collate([sample.prepared for sample in samples])
         loaded = time.process_time()
         begin = clock()
-        inputs = inputs.to(device)
+        inputs = to_device(inputs, device)
         with torch.autocast(torch.device(device).type, torch.bfloat16, enabled=in_bfloat16):
             loss = torch.stack(list(model.loss(model.predict(inputs), inputs).values())).sum()
         optimizer.zero_grad()
