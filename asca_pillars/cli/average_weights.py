@@ -26,7 +26,8 @@ def average_weights(
 
     After a training that started from other weights (`asca train --init`), the average of both often finds more than
     either: it knows the new data, and keeps what the first weights knew of the rest. The network and its cost stay the
-    same. Configuration and expected input are those of the first checkpoint.
+    same. Configuration and expected input are those of the first checkpoint; of a bundle, its score thresholds and
+    suppression too.
 
     Examples:
 
@@ -37,6 +38,8 @@ def average_weights(
     require("train")
     from rich.console import Console
 
+    from asca_deploy.bundle import MANIFEST
+    from asca_deploy.manifest import load_bundle
     from asca_deploy.shipped import find_checkpoint
     from asca_pillars.base.errors import ConfigError
     from asca_pillars.models.average import average_checkpoints
@@ -47,5 +50,8 @@ def average_weights(
         given = None if shares is None else [float(share) for share in shares.split(",")]
     except ValueError:
         raise ConfigError(f"--shares {shares}: give numbers and commas, such as 0.7,0.3") from None
-    average_checkpoints([find_checkpoint(checkpoint) for checkpoint in checkpoints], out, given)
+    paths = [find_checkpoint(checkpoint) for checkpoint in checkpoints]
+    folder = paths[0].parent
+    shipped_as = load_bundle(folder).spec if (folder / MANIFEST).exists() else None
+    average_checkpoints(paths, out, given, shipped_as=shipped_as)
     Console(markup=False, soft_wrap=True).print(f"Written: {out}")

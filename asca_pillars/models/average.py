@@ -1,16 +1,24 @@
 """Average of the weights of several checkpoints of one network."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from torch import Tensor
 
 from asca_pillars.base.errors import ConfigError
 from asca_pillars.base.schema import to_dict
+from asca_pillars.detection.spec import DetectorSpec
 from asca_pillars.models.checkpoint_file import read_checkpoint, require_same_arrays, write_plain
 
 
-def average_checkpoints(paths: Sequence[str | Path], out: str | Path, shares: Sequence[float] | None = None) -> None:
+def average_checkpoints(
+    paths: Sequence[str | Path],
+    out: str | Path,
+    shares: Sequence[float] | None = None,
+    *,
+    shipped_as: DetectorSpec | None = None,
+) -> None:
     """Write a checkpoint whose weights are the weighted mean of those of several: a model soup (arXiv 2203.05482).
 
     Averages are good where the checkpoints lie near each other: of one run, or where one was trained from the other
@@ -21,6 +29,8 @@ def average_checkpoints(paths: Sequence[str | Path], out: str | Path, shares: Se
         paths: two or more checkpoints of networks with the same arrays.
         out: the checkpoint to write.
         shares: of each, not negative; divided by their sum. None for equal ones.
+        shipped_as: of the bundle that the first one lies in: its score thresholds and suppression go into the average,
+            because a bundle has others than its weights were trained with. None: those of the first checkpoint.
 
     Raises:
         ConfigError: there are fewer than two, or the shares are not the weights of a mean.
@@ -42,9 +52,13 @@ def average_checkpoints(paths: Sequence[str | Path], out: str | Path, shares: Se
         name: _mean([file.weights[name] for file in files], [share / sum(given) for share in given])
         for name in files[0].weights
     }
-    expected_input = files[0].expected_input
+    config, expected_input = files[0].config, files[0].expected_input
+    if shipped_as is not None:
+        scores = {each.name: each.score_threshold for each in shipped_as.classes}
+        spec = replace(config.model.spec.with_score_threshold(scores), post=shipped_as.post)
+        config = replace(config, model=replace(config.model, spec=spec))  # type: ignore[arg-type]  # of the same kind
     about = {
-        "config": to_dict(files[0].config),
+        "config": to_dict(config),
         "expected_input": None if expected_input is None else to_dict(expected_input),
     }
     content = {

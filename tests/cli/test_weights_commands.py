@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from asca_deploy.manifest import load_bundle
 from asca_deploy.shipped import find_weights
 from asca_pillars.models.checkpoint import load_checkpoint
 from tests.helpers.in_process import run_here
@@ -30,9 +31,13 @@ def test_a_model_that_ships_and_a_checkpoint_are_averaged(tmp_path: Path) -> Non
     out = tmp_path / "average.ckpt"
     done = run_here("average-weights", "default", find_weights("default"), "-o", out, "--shares", "0.3,0.7")
     assert done.returncode == 0, done.stderr
-    ours, theirs = (load_checkpoint(path).detector.state_dict() for path in (out, find_weights("default")))
-    for name, value in ours.items():
-        torch.testing.assert_close(value, theirs[name], msg=name)
+    ours, theirs = (load_checkpoint(path) for path in (out, find_weights("default")))
+    weights = theirs.detector.state_dict()
+    for name, value in ours.detector.state_dict().items():
+        torch.testing.assert_close(value, weights[name], msg=name)
+    shipped, spec = load_bundle(find_weights("default").parent).spec, ours.config.model.spec
+    assert spec.post == shipped.post != theirs.config.model.spec.post
+    assert [one.score_threshold for one in spec.classes] == [one.score_threshold for one in shipped.classes]
 
 
 @pytest.mark.parametrize(
