@@ -38,9 +38,7 @@ def average_weights(
     require("train")
     from rich.console import Console
 
-    from asca_deploy.bundle import MANIFEST
-    from asca_deploy.manifest import load_bundle
-    from asca_deploy.shipped import find_checkpoint
+    from asca_deploy.shipped import bundle_of_checkpoint, find_checkpoint
     from asca_pillars.base.errors import ConfigError
     from asca_pillars.models.average import average_checkpoints
     from asca_pillars.models.checkpoint_file import require_new_checkpoint
@@ -51,7 +49,6 @@ def average_weights(
     except ValueError:
         raise ConfigError(f"--shares {shares}: give numbers and commas, such as 0.7,0.3") from None
     paths = [find_checkpoint(checkpoint) for checkpoint in checkpoints]
-    folder = paths[0].parent
-    shipped_as = load_bundle(folder).spec if (folder / MANIFEST).exists() else None
-    average_checkpoints(paths, out, given, shipped_as=shipped_as)
+    bundle = bundle_of_checkpoint(checkpoints[0])
+    average_checkpoints(paths, out, given, shipped_as=None if bundle is None else bundle.spec)
     Console(markup=False, soft_wrap=True).print(f"Written: {out}")

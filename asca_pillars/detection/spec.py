@@ -88,6 +88,15 @@ class DetectorSpec(Strict, ABC):
             ),
         )
 
+    def with_post_processing_of(self, other: "DetectorSpec") -> Self:
+        """Return the same detector with the score thresholds and the suppression of another one, of the same classes.
+
+        Raises:
+            ConfigError: the other one has a class that this one lacks.
+        """
+        scores = {each.name: each.score_threshold for each in other.classes}
+        return replace(self.with_score_threshold(scores), post=other.post)
+
     def decode(self, maps: HeadMaps[NDArray[np.float32]], cells: NDArray[np.integer[Any]] | None = None) -> Detections:
         """Decode head maps of one scan, (channels, H, W) each, into detections, LiDAR frame.
 

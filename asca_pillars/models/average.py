@@ -54,8 +54,7 @@ def average_checkpoints(
     }
     config, expected_input = files[0].config, files[0].expected_input
     if shipped_as is not None:
-        scores = {each.name: each.score_threshold for each in shipped_as.classes}
-        spec = replace(config.model.spec.with_score_threshold(scores), post=shipped_as.post)
+        spec = config.model.spec.with_post_processing_of(shipped_as)
         config = replace(config, model=replace(config.model, spec=spec))  # type: ignore[arg-type]  # of the same kind
     about = {
         "config": to_dict(config),

@@ -5,7 +5,7 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from asca_deploy.bundle import MANIFEST, weights_digest
+from asca_deploy.bundle import MANIFEST, Bundle, weights_digest
 from asca_deploy.manifest import load_bundle
 from asca_deploy.manifest_file import refuse_run_folder
 from asca_pillars.base.errors import BundleError
@@ -83,6 +83,17 @@ def find_checkpoint(source: str | Path) -> Path:
     """
     path = Path(source)
     return path if path.is_file() or path.suffix == Path(WEIGHTS_FILE).suffix else find_weights(source)
+
+
+def bundle_of_checkpoint(source: str | Path) -> Bundle | None:
+    """Return the bundle that `source` names, whose checkpoint `find_checkpoint` gives; None for a checkpoint itself.
+
+    Raises:
+        BundleError: as `find_weights`, or it is damaged.
+    """
+    path = find_checkpoint(source)
+    # The folder of a run's checkpoints holds weights, too, but no manifest.
+    return load_bundle(path.parent) if path != Path(source) and (path.parent / MANIFEST).exists() else None
 
 
 def sample_scan_path() -> Path:

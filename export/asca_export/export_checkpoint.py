@@ -9,16 +9,14 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from asca_deploy.bundle import BUNDLE_FOLDER, MANIFEST, Bundle
-from asca_deploy.manifest import load_bundle
-from asca_deploy.shipped import find_checkpoint
+from asca_deploy.bundle import BUNDLE_FOLDER, Bundle
+from asca_deploy.shipped import bundle_of_checkpoint, find_checkpoint
 from asca_pillars.base.errors import ConfigError, TrainingError
 from asca_pillars.base.extras import require
 from asca_pillars.base.own_files import require_not_input, require_replaceable
 from asca_pillars.base.progress import Progress, Reporter
 from asca_pillars.base.settings import with_overrides
 from asca_pillars.config.pillar import PillarModel
-from asca_pillars.detection.decode import PostProcess
 from asca_pillars.detection.spec import DetectorSpec, ScoreThresholds
 from asca_pillars.ops.pillar.spec import PillarSpec
 from asca_pillars.scans.find_scans import find_scans
@@ -40,11 +38,8 @@ class Source(NamedTuple):
     path: Path
     """Path of the checkpoint."""
     checkpoint: "Checkpoint"
-    score_thresholds: dict[str, float]
-    """Thresholds by class of the bundle that holds the checkpoint; empty for other checkpoints, whose config has
-    them."""
-    post: PostProcess | None
-    """Suppression and votes of this bundle; None for other checkpoints."""
+    shipped_as: DetectorSpec | None
+    """Of the bundle that holds the checkpoint: its thresholds and suppression count. None for other checkpoints."""
     trained_on: str
     command: str
     """The command that trained it."""
@@ -99,11 +94,11 @@ def export(
     require_not_input(out, (scans, calibrate))
     source = open_source(checkpoint)
     loaded = source.checkpoint
-    spec = loaded.config.model.spec.with_score_threshold(source.score_thresholds)
+    spec = loaded.config.model.spec
+    if source.shipped_as is not None:
+        spec = spec.with_post_processing_of(source.shipped_as)
     if score is not None:
         spec = spec.with_score_threshold(score)
-    if source.post is not None:
-        spec = replace(spec, post=source.post)
     if post:
         spec = replace(spec, post=with_overrides(spec.post, post, f"--post {' --post '.join(post)}"))
     if range_m is not None:
@@ -147,14 +142,10 @@ def open_source(source: Path) -> Source:
 
     path = find_checkpoint(source)
     checkpoint = load_checkpoint(path)
-    if not (path.parent / MANIFEST).exists():  # the folder of a run's checkpoints holds weights, too
-        source = path
-    if path == source:
-        command = run_environment(source).get("command", "not recorded")
-        return Source(path, checkpoint, {}, None, "not stated", command)
-    bundle = load_bundle(path.parent)
-    scores = {each.name: each.score_threshold for each in bundle.spec.classes}
-    return Source(path, checkpoint, scores, bundle.spec.post, bundle.provenance.trained_on, bundle.provenance.command)
+    bundle = bundle_of_checkpoint(source)
+    if bundle is None:
+        return Source(path, checkpoint, None, "not stated", run_environment(path).get("command", "not recorded"))
+    return Source(path, checkpoint, bundle.spec, bundle.provenance.trained_on, bundle.provenance.command)
 
 
 def with_ranges(model: "ModelConfig", spec: DetectorSpec, range_m: tuple[float, float, float, float]) -> PillarSpec:

@@ -21,7 +21,7 @@ def test_the_folder_of_a_run_s_checkpoints_is_its_weights(checkpoint: Path) -> N
     checkpoint.parent.mkdir(parents=True)
     save_checkpoint(checkpoint.with_name("weights.ckpt"), tiny_checkpoint("none"))
     source = open_source(checkpoint.parent)
-    assert source.path == checkpoint.with_name("weights.ckpt") and not source.score_thresholds
+    assert source.path == checkpoint.with_name("weights.ckpt") and source.shipped_as is None
 
 
 def test_the_command_of_the_run_is_known(checkpoint: Path) -> None:
