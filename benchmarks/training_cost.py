@@ -10,6 +10,7 @@ time (all threads together); for a step on a device other than a CPU in wall tim
 """
 
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -21,9 +22,11 @@ from rich.progress import track
 from asca_pillars.base.system import cpu_model
 from asca_pillars.cli.run_command import run_command
 from asca_pillars.config.tree import load_config
+from asca_pillars.config.two_stage import RefineModel
 from asca_pillars.evaluation.report_page import markdown_table
 from asca_pillars.models.build import build_model
 from asca_pillars.models.trainable import to_device
+from asca_pillars.models.two_stage.first_stage import with_first_stage
 from asca_pillars.training.dataset import open_dataset
 from asca_pillars.training.module import resolve_precision
 
@@ -39,6 +42,8 @@ def main(
 ) -> None:
     """Print milliseconds per sample of loading and of a step."""
     settings = load_config(config, override or ())
+    if isinstance(settings.model, RefineModel):
+        settings = replace(settings, model=with_first_stage(settings.model))
     frames = open_dataset(data, settings, training=True)
     model = build_model(settings.model).to(device)
     model.train()

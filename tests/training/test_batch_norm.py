@@ -1,0 +1,65 @@
+"""Batch normalization of a checkpoint, from frames: torch's own running statistics of the same network and batches."""
+
+import dataclasses
+from pathlib import Path
+
+import pytest
+import torch
+from torch import nn
+
+from asca_pillars.base.errors import DatasetError
+from asca_pillars.base.progress import Reporter
+from asca_pillars.config.pillar import NetworkConfig, PillarModel
+from asca_pillars.config.tree import Config, DataConfig
+from asca_pillars.models.build import build_model
+from asca_pillars.models.checkpoint import Checkpoint, load_checkpoint
+from asca_pillars.training.batch_norm import BATCH_FRAMES, update_batch_norm
+from asca_pillars.training.dataset import open_dataset
+from tests.helpers.saved_checkpoint import save_checkpoint
+from tests.helpers.scenes import SPEC, write_dataset
+
+NETWORK = NetworkConfig(block_channels=(4, 4, 4), upsample_channels=4)
+CONFIG = Config(
+    model=PillarModel(spec=SPEC, network=NETWORK), data=DataConfig(train_set="none", val_set="none", workers=0)
+)
+
+
+def test_statistics_are_those_of_the_frames_and_weights_stay(tmp_path: Path) -> None:
+    data, path = write_dataset(tmp_path / "data", 3), tmp_path / "average.ckpt"
+    torch.manual_seed(0)
+    detector = build_model(CONFIG.model)
+    save_checkpoint(path, Checkpoint(CONFIG, detector, 7))
+    with pytest.raises(DatasetError, match=r"none\.txt: no such split"):
+        update_batch_norm(path, data)
+    steps: list[tuple[str, int, int]] = []
+    update_batch_norm(path, data, "training", frames=2, reporter=_recorder(steps))
+    assert steps[-1] == ("Batch normalization", 1, 1) and BATCH_FRAMES > 2
+    loaded = load_checkpoint(path)
+    assert loaded.steps == 7 and loaded.config == CONFIG
+
+    insert = dataclasses.replace(CONFIG.augment.insert, method="none")
+    config = dataclasses.replace(
+        CONFIG,
+        augment=dataclasses.replace(CONFIG.augment, insert=insert),
+        data=dataclasses.replace(CONFIG.data, train_set="training"),
+    )
+    frames = open_dataset(data, config, training=True)
+    candidates = []
+    for pair in ((0, 1), (0, 2), (1, 2)):
+        detector = build_model(CONFIG.model)
+        detector.load_state_dict(loaded.detector.state_dict())
+        for part in detector.modules():
+            if isinstance(part, nn.BatchNorm1d | nn.BatchNorm2d):
+                part.momentum = 1.0  # the statistics of the last batch
+        samples = [frames.sample(0, number).prepared for number in pair]
+        with torch.no_grad():
+            detector.train().predict(frames.preparation.collate(samples))
+        candidates.append(detector.state_dict())
+    state = loaded.detector.state_dict()
+    names = [name for name in state if "running" in name]
+    off = sorted(max(float((each[name] - state[name]).abs().max()) for name in names) for each in candidates)
+    assert off[0] < 1e-4 < 1e-3 < off[1]
+
+
+def _recorder(steps: list[tuple[str, int, int]]) -> Reporter:
+    return Reporter(lambda step, done, total: steps.append((step, done, total)))
