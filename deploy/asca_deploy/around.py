@@ -115,6 +115,20 @@ def ranges_around(ranges: Ranges, passes: int) -> Ranges:
     return Ranges((-reach, reach), (-reach, reach), ranges.z_m)
 
 
+def without_own_vehicle(found: Detections) -> Detections:
+    """Return the boxes that the sensor is not in; one that it is in, seen from above, is the vehicle that carries it.
+
+    KITTI's sensor sees nothing of its car, and the simulated one neither. Others see its roof or bonnet, which a model
+    takes for another car.
+
+    Args:
+        found: in the model's frame, whose z axis leads through the sensor or the vehicle.
+    """
+    x, y, _, length, width, _, yaw = found.boxes.astype(np.float64).T
+    along, across = x * np.cos(yaw) + y * np.sin(yaw), y * np.cos(yaw) - x * np.sin(yaw)
+    return found[(np.abs(along) > length / 2) | (np.abs(across) > width / 2)]
+
+
 def merge(passes: Sequence[Detections], turns: Sequence[FrameChange], nms_iou: float) -> Detections:
     """Return the boxes of all passes in the frame before the turns, each object once, best first.
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_deploy import auto, providers
-from asca_deploy.around import about_ground, merge, ranges_around, turns_around, widen_ranges
+from asca_deploy.around import about_ground, merge, ranges_around, turns_around, widen_ranges, without_own_vehicle
 from asca_deploy.bundle import Bundle, weights_digest
 from asca_deploy.manifest import load_bundle
 from asca_deploy.open_pipeline import open_pipeline
@@ -256,6 +256,8 @@ class Detector:
 
     def _finish(self, frame: _Frame, raw: list[Any]) -> ScanDetections:
         found = [self.pipeline.finish(one, frame.stage_times) for one in raw]
+        if self.view == "around":
+            found = [without_own_vehicle(one) for one in found]
         if self.passes == 1:
             detections, counts = found[0], frame.counts[0]
         else:

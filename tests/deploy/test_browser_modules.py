@@ -14,7 +14,7 @@ import pytest
 from numpy.typing import NDArray
 
 from asca_deploy import sample_scan_path, shipped_bundles
-from asca_deploy.around import about_ground, merge, turns_around, widen_ranges
+from asca_deploy.around import about_ground, merge, turns_around, widen_ranges, without_own_vehicle
 from asca_deploy.bundle import PillarBundle
 from asca_deploy.golden import write_golden
 from asca_deploy.manifest import load_pillar_bundle
@@ -205,6 +205,16 @@ def test_as_many_passes_or_as_wide_ranges_as_python_takes(camera_view: bool) -> 
         assert found["grid"] | {"x_range_m": [*grid.x_range_m], "y_range_m": [*grid.y_range_m]} == found["grid"]
         assert found["limits"]["max_pillars"] == limits.max_pillars
         assert (looked.spec == bundle.spec) == (camera_view or bundle.pillar.neck == "dense")
+
+
+def test_a_box_around_the_sensor_is_left_out_as_by_python() -> None:
+    rng = np.random.default_rng(4)
+    drawn = np.column_stack([rng.uniform(-4, 4, (300, 3)), rng.uniform(1, 5, (300, 3)), rng.uniform(-3, 3, 300)])
+    boxes = drawn.astype(np.float32)
+    rest = without_own_vehicle(Detections(boxes, np.ones(300, np.float32), np.zeros(300, np.int64), ("Car",)))
+    answer = call("around.js", "withoutOwnVehicle", [[{"box": box} for box in boxes.tolist()]])[0]["result"]
+    assert 100 < len(rest) < 280
+    np.testing.assert_array_equal(np.array([one["box"] for one in answer], np.float32), rest.boxes)
 
 
 def test_boxes_of_several_passes_are_merged_as_by_python() -> None:

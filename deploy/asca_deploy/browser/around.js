@@ -66,6 +66,18 @@ export function aboutGround(turns, points) {
 }
 
 /**
+ * The boxes that the sensor is not in; one that it is in, seen from above, is the vehicle that carries it.
+ * @param {{box: number[]|Float32Array}[]} found in the model's frame
+ */
+export function withoutOwnVehicle(found) {
+  return found.filter(({ box: [x, y, , length, width, , yaw] }) => {
+    const along = x * Math.cos(yaw) + y * Math.sin(yaw);
+    const across = y * Math.cos(yaw) - x * Math.sin(yaw);
+    return Math.abs(along) > length / 2 || Math.abs(across) > width / 2;
+  });
+}
+
+/**
  * The boxes of all passes, each object once, best first: of those of a class that overlap, the one stays that its pass
  * sees nearest to straight ahead.
  * @param {{box: Float32Array, score: number, label: any, offAhead: number}[]} found in one frame; `offAhead`: the angle

@@ -1,6 +1,6 @@
 /** A bundle in ONNX Runtime: points in, boxes out. Knows no page, so that node runs it too. */
 
-import { aboutGround, turnsAround, widenRanges } from "./around.js";
+import { aboutGround, turnsAround, widenRanges, withoutOwnVehicle } from "./around.js";
 import { decodeCandidates, suppress } from "./boxes.js";
 import { changeBox, changePoints, inverse, turnBy } from "./frames.js";
 import { makeGrid, percentBehind } from "./grid.js";
@@ -69,7 +69,8 @@ export class Detector {
     const level = turns.length === 1 ? turns : aboutGround(turns, points);
     for (const [pass, turn] of level.entries()) {
       const back = inverse(turn);
-      for (const { box, ...found } of await this.pass(changePoints(turn, points), field, timesMs, counts)) {
+      const seen = await this.pass(changePoints(turn, points), field, timesMs, counts);
+      for (const { box, ...found } of everywhere ? withoutOwnVehicle(seen) : seen) {
         detections.push({ ...found, box: changeBox(back, box), pass, offAhead: Math.abs(Math.atan2(box[1], box[0])) });
       }
     }
