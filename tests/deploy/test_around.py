@@ -6,13 +6,14 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from shapely import MultiPoint, Point
 
-from asca_deploy import sample_scan_path
-from asca_deploy.around import about_ground, merge, ranges_around, turns_around
+from asca_deploy import Detector, sample_scan_path
+from asca_deploy.around import about_ground, merge, ranges_around, turns_around, without_own_vehicle
 from asca_deploy.open_model import RuntimeOptions, files_need_around
 from asca_pillars.base.errors import ConfigError
 from asca_pillars.detection.detections import Detections
-from asca_pillars.geometry.boxes import wrap_angle
+from asca_pillars.geometry.boxes import corners, wrap_angle
 from asca_pillars.geometry.frame_change import FrameChange
 from asca_pillars.geometry.ranges import Ranges
 from asca_pillars.scans.scan_input import ScanInput
@@ -54,6 +55,31 @@ def test_as_many_passes_as_the_field_of_view_needs(ranges: Ranges, camera_view: 
 def test_a_model_that_does_not_see_to_both_sides_is_not_turned(y_m: tuple[float, float]) -> None:
     with pytest.raises(ConfigError, match=r"view around: the model looks .* choose view ahead"):
         turns_around(Ranges((0.0, 69.12), y_m, Z_M), camera_view=True)
+
+
+@given(st.lists(st.tuples(*[st.floats(-3, 3)] * 2, *[st.floats(0.5, 6)] * 2, st.floats(-3.2, 3.2)), max_size=8))
+def test_a_box_around_the_sensor_is_left_out(rows: list[tuple[float, ...]]) -> None:
+    boxes = np.array([[x, y, 0, length, width, 1, yaw] for x, y, length, width, yaw in rows], np.float32).reshape(-1, 7)
+    scores, labels = np.linspace(0, 1, len(boxes), dtype=np.float32), np.zeros(len(boxes), np.int64)
+    rest = without_own_vehicle(Detections(boxes, scores, labels, ("Car",)))
+    kept = set(rest.scores.tolist())
+    for box, score in zip(boxes, scores.tolist(), strict=True):
+        area = MultiPoint(corners(box[None])[0, :, :2]).convex_hull
+        if area.boundary.distance(Point(0, 0)) > 1e-4:
+            assert (score in kept) != area.contains(Point(0, 0))
+
+
+def test_around_leaves_out_the_box_around_the_sensor_and_ahead_does_not(
+    tiny_bundle: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    boxes = np.array([[0.5, 0, -1, 4, 1.6, 1.5, 0], [6, 0, -1, 4, 1.6, 1.5, 0]], np.float32)
+    found = Detections(boxes, np.array([0.9, 0.8], np.float32), np.zeros(2, np.int64), NAMES)
+    points = np.zeros((5, 4), np.float32)
+    for view, left in (("ahead", 2), ("around", 1)):
+        detector = Detector(tiny_bundle, view=view)  # type: ignore[arg-type]
+        monkeypatch.setattr(detector.pipeline, "finish", lambda *_: found)
+        monkeypatch.setattr(detector, "_turns", (FrameChange.turn(0.0),))
+        assert len(detector(points)) == left
 
 
 @given(st.floats(-np.pi, np.pi), st.floats(1, 30))
@@ -131,16 +157,17 @@ def test_scans_all_around_the_sensor_are_looked_at_in_every_direction(tmp_path: 
     revolution = read_scan(sample_scan_path()).points
     turned = np.column_stack([-revolution[:, 1], revolution[:, 0], revolution[:, 2:]])  # x right, y forward
     part = revolution[np.abs(np.arctan2(revolution[:, 1], revolution[:, 0])) < 0.7]
-    for points, axes, expected in [
-        (revolution, "x-forward", True),
-        (turned, "y-forward", True),
-        (part, "x-forward", False),
+    for points, axes, bundle, cost in [
+        (revolution, "x-forward", "default", "in one pass"),
+        (turned, "y-forward", "default", "in one pass"),
+        (revolution, "x-forward", "accurate", "in 4 passes"),
+        (part, "x-forward", "default", None),
     ]:
         path = tmp_path / "scan.npy"
         np.save(path, points)
         scan_input = ScanInput(ScanSettings(axes=axes), [path])
-        assert files_need_around(RuntimeOptions(), scan_input) == expected
-        assert [line for line in scan_input.notes if "looking all around, in 4 passes (--ahead" in line] or not expected
+        assert files_need_around(RuntimeOptions(bundle=bundle), scan_input) == (cost is not None)
+        assert cost is None or any(f"looking all around, {cost} (--ahead" in line for line in scan_input.notes)
     in_kitti_layout = tmp_path / "velodyne" / "000000.bin"
     for file in (in_kitti_layout, tmp_path / "calib" / "000000.txt"):
         file.parent.mkdir()

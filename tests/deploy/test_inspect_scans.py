@@ -100,7 +100,7 @@ def test_what_is_printed_and_written(folder: Path) -> None:
         output = invoke("inspect", folder, "--json", report, "-n", 2)
     assert "2 of 3 scans measured" in output and "--around" in output
     written = json.loads(report.read_text())
-    assert written["inspected"] == 2 and written["findings"] and written["expected"]["camera_view"] is True
+    assert written["inspected"] == 2 and written["findings"] and written["expected"]["camera_view"] is False
     assert written["height"]["scans"] == 2 and written["model"] == "default"
     write_scan(folder / "own" / "1.bin", POINTS[POINTS[:, 0] > 0])
     output = invoke("inspect", folder / "own" / "1.bin", "--bundle", "fast")
