@@ -108,8 +108,10 @@ def test_the_browser_finds_the_boxes_that_python_finds(name: str, tmp_path: Path
 
 @needs_ort_web
 @needs_chromium
-@pytest.mark.parametrize("name", ["dense_float32", "default_float32"])
-def test_the_browser_looks_around_and_takes_a_mounting_as_python_does(name: str, tmp_path: Path, tab: Tab) -> None:
+@pytest.mark.parametrize(("name", "passes"), [("dense_float32", 4), ("default_float32", 1)])
+def test_the_browser_looks_around_and_takes_a_mounting_as_python_does(
+    name: str, passes: int, tmp_path: Path, tab: Tab
+) -> None:
     page = tmp_path / "page"
     bundle = MODELS[name]
     write_page(page, bundle, sample_scan_path(), find_ort_web(Path(str(ORT_WEB))))
@@ -120,7 +122,7 @@ def test_the_browser_looks_around_and_takes_a_mounting_as_python_does(name: str,
     with file_server(page) as address:
         tab.call("Page.navigate", url=address)
         by_itself = finished(tab, "sample.bin")
-        assert by_itself["passes"] == 4 and "49% of the points lie behind the sensor: looked at all" in status(tab)
+        assert by_itself["passes"] == passes and "49% of the points lie behind the sensor: looked at all" in status(tab)
         set_sensor(tab)
         ahead = finished(tab, "sample.bin")
         set_sensor(tab, around=True)
@@ -128,7 +130,7 @@ def test_the_browser_looks_around_and_takes_a_mounting_as_python_does(name: str,
         saved = finished(tab, "sample.bin")
         assert saved["boxes"] == by_itself["boxes"]
         assert_same(saved, around, points, least=len(ahead["boxes"]) + 4)
-        assert (saved["passes"], saved["warnings"]) == (4, []) and "in 4 passes" in status(tab)
+        assert (saved["passes"], saved["warnings"]) == (passes, []) and ("in 4 passes" in status(tab)) == (passes == 4)
         low = {"Car": 0.15, "Pedestrian": 0.2}
         for class_, score in low.items():
             move_slider(tab, class_, score)
@@ -183,11 +185,16 @@ def set_sensor(tab: Tab, *, around: bool = False, axes: str = "", height: str = 
 
 
 def assert_same(saved: Any, detector: Detector, points: NDArray[np.float32], least: int = 4) -> None:
+    in_turn = [box["score"] for box in saved["boxes"]]
+    assert in_turn == sorted(in_turn, reverse=True)
     expected = detector(points)
     assert len(expected) >= least
-    assert [box["class"] for box in saved["boxes"]] == list(expected.names)
-    centers = np.array([[box["x_m"], box["y_m"], box["z_m"]] for box in saved["boxes"]])
-    scores = np.array([box["score"] for box in saved["boxes"]])
+    # By class and distance: of boxes whose scores tie a rounding decides which comes first.
+    expected = expected[np.lexsort((expected.boxes[:, 0], np.array(expected.names)))]
+    boxes = sorted(saved["boxes"], key=lambda box: (box["class"], box["x_m"]))
+    assert [box["class"] for box in boxes] == list(expected.names)
+    centers = np.array([[box["x_m"], box["y_m"], box["z_m"]] for box in boxes])
+    scores = np.array([box["score"] for box in boxes])
     np.testing.assert_allclose(scores, expected.scores, atol=SCORE_TOLERANCE)
     far = np.linalg.norm(centers - expected.boxes[:, :3], axis=1) >= NEAR_M
     if detector.bundle.precision == "int8":
