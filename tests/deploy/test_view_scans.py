@@ -27,6 +27,7 @@ from asca_pillars.scans.scan_reader import read_scan, write_scan
 from asca_pillars.scans.scan_settings import ScanSettings
 from tests.deploy.chromium import CHROMIUM, open_tab
 from tests.deploy.page_driver import assert_drawn, failure, finished, move_slider
+from tests.helpers.bundles import DENSE_INT8
 
 POINTS = read_scan(sample_scan_path()).points[::2].copy()
 SMALL = RuntimeOptions(bundle="fast", threads=1)
@@ -107,7 +108,7 @@ def shown(page: Any, found: Any) -> list[Any]:
 
 def test_what_several_passes_find_is_not_lowered() -> None:
     """Of two passes the box stays that is seen nearest to straight ahead, whatever the scores."""
-    with serving([sample_scan_path()], around=True) as server:
+    with serving([sample_scan_path()], around=True, bundle=str(DENSE_INT8)) as server:
         classes = json.loads(get(server, "page.json"))["classes"]
     assert [one["lowest"] for one in classes] == [one["score"] for one in classes]
 
