@@ -1,6 +1,8 @@
 """`asca average-weights`: the average of the weights of several checkpoints."""
 
+import shutil
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Annotated
 
 import typer
@@ -75,9 +77,12 @@ def average_weights(
     paths = [find_checkpoint(checkpoint) for checkpoint in checkpoints]
     bundle = bundle_of_checkpoint(checkpoints[0])
     console = Console(markup=False, soft_wrap=True)
-    with atomic_path(out) as temporary:
-        average_checkpoints(paths, temporary, given, shipped_as=None if bundle is None else bundle.spec)
+    with TemporaryDirectory() as folder:
+        average = Path(folder) / out.name
+        average_checkpoints(paths, average, given, shipped_as=None if bundle is None else bundle.spec)
         if update_bn is not None:
             with Bars(console) as bars:
-                update_batch_norm(temporary, update_bn, split, reporter=Reporter(bars))
+                update_batch_norm(average, update_bn, split, reporter=Reporter(bars))
+        with atomic_path(out) as temporary:
+            shutil.copyfile(average, temporary)
     console.print(f"Written: {out}")

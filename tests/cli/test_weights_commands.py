@@ -7,7 +7,9 @@ import torch
 
 from asca_deploy.manifest import load_bundle
 from asca_deploy.shipped import find_weights
+from asca_pillars.base.locks import recover
 from asca_pillars.models.checkpoint import load_checkpoint
+from asca_pillars.training import batch_norm
 from tests.helpers.in_process import run_here
 from tests.models.openpcdet.foreign_networks import PointPillars, write_foreign
 
@@ -40,6 +42,15 @@ def test_a_model_that_ships_and_a_checkpoint_are_averaged(tmp_path: Path) -> Non
     specs = (theirs.config.model.spec, spec, shipped)
     trained, averaged, released = ([one.score_threshold for one in each.classes] for each in specs)
     assert averaged == released != trained
+
+
+def test_another_command_in_the_folder_removes_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As `asca export` does, which begins by removing what killed writers left."""
+    monkeypatch.setattr(batch_norm, "update_batch_norm", lambda *_, **__: recover(tmp_path))
+    out = tmp_path / "average.ckpt"
+    done = run_here("average-weights", "default", "default", "-o", out, "--update-bn", tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert load_checkpoint(out).config.name and [path.name for path in tmp_path.iterdir()] == [out.name]
 
 
 @pytest.mark.parametrize(
