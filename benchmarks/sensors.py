@@ -68,8 +68,14 @@ def recall(
         quarter = np.round(bearing_deg / 90) % 4  # ahead, left, behind, right
         groups = quarter == 0, quarter % 2 == 1, quarter == 2, np.abs(bearing_deg % 90 - 45) < SEAM_DEG
         rows.append((f"{name} ({len(hit)})", *(_share(int(hit[own].sum()), int(own.sum())) for own in groups)))
-    print(f"{len(split.frame_ids[:frames])} revolutions, {detector.folder.name} in {detector.passes} passes\n")
-    print(markdown_table(("", "ahead", "left and right", "behind", f"at a seam, {SEAM_DEG:g} degrees"), rows, left=1))
+    print(f"{len(split.frame_ids[:frames])} revolutions, {detector.folder.name}, passes: {detector.passes}\n")
+    print(
+        markdown_table(
+            ("", "ahead", "left and right", "behind", f"within {SEAM_DEG:g} degrees of 45 and 135 degrees"),
+            rows,
+            left=1,
+        )
+    )
 
 
 def _bearings(split: KittiSplit, frame_id: str, name: str, points: Points, boxes: Points) -> NDArray[np.float64]:

@@ -47,13 +47,13 @@ def average_weights(
     either: it knows the new data, and keeps what the first weights knew of the rest. The network and its cost stay the
     same. Configuration and expected input are those of the first checkpoint; of a bundle, its score thresholds and
     suppression too. With --update-bn the statistics of batch normalization are computed again, as
-    torch.optim.swa_utils.update_bn does: give simulated scans, or those of the training.
+    torch.optim.swa_utils.update_bn does: give hundreds of scans like those of the trainings.
 
     Examples:
 
     asca average-weights runs/mine/checkpoints/last.ckpt default -o average.ckpt
 
-    asca average-weights runs/mine/checkpoints/last.ckpt default --shares 0.3,0.7 --update-bn data/mine -o average.ckpt
+    asca average-weights runs/mine/checkpoints/last.ckpt default --shares 0.3,0.7 --update-bn data/sim -o average.ckpt
     """
     require("train")
     from rich.console import Console

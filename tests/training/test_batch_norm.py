@@ -29,6 +29,7 @@ def test_statistics_are_those_of_the_frames_and_weights_stay(tmp_path: Path) -> 
     torch.manual_seed(0)
     detector = build_model(CONFIG.model)
     save_checkpoint(path, Checkpoint(CONFIG, detector, 7))
+    saved = detector.state_dict()
     with pytest.raises(DatasetError, match=r"none\.txt: no such split"):
         update_batch_norm(path, data)
     steps: list[tuple[str, int, int]] = []
@@ -59,6 +60,8 @@ def test_statistics_are_those_of_the_frames_and_weights_stay(tmp_path: Path) -> 
     names = [name for name in state if "running" in name]
     off = sorted(max(float((each[name] - state[name]).abs().max()) for name in names) for each in candidates)
     assert off[0] < 1e-4 < 1e-3 < off[1]
+    for name, value in saved.items():
+        assert name in names or torch.equal(state[name], value), name
 
 
 def _recorder(steps: list[tuple[str, int, int]]) -> Reporter:
