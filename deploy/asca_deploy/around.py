@@ -42,7 +42,8 @@ def widen_ranges(bundle: Bundle) -> Bundle:
     """Return the bundle with ranges widened in every direction to its farthest reach, where its graphs allow it.
 
     That requires a sparse neck, which reads rulebooks instead of a map, pillars of one size, and weights trained on
-    whole revolutions. Other bundles are returned unchanged.
+    whole revolutions. Other bundles are returned unchanged. A second stage gets as many times the proposals and
+    keypoints as there would be turned passes.
     """
     if not isinstance(bundle, PillarBundle) or bundle.pillar.neck == "dense" or bundle.expected_input.camera_view:
         return bundle
@@ -51,7 +52,11 @@ def widen_ranges(bundle: Bundle) -> Bundle:
         return bundle
     reach = max(abs(end) for end in (*grid.x_range_m, *grid.y_range_m))
     x_end, y_end = (_fitting_range(reach, pillar_m) for pillar_m in (grid.v_max_m, grid.v_y_m))
-    return replace(bundle, spec=spec.with_ranges((-x_end, x_end), (-y_end, y_end)))
+    refine = bundle.refine
+    if refine is not None:
+        passes = len(turns_around(spec.ranges, camera_view=False))
+        refine = replace(refine, seen=refine.seen.scaled(passes))
+    return replace(bundle, spec=spec.with_ranges((-x_end, x_end), (-y_end, y_end)), refine=refine)
 
 
 def _fitting_range(reach_m: float, pillar_m: float) -> float:

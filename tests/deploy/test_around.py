@@ -1,5 +1,6 @@
 """When a detector looks all around, which passes there are, and how their boxes become one list."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,8 +10,11 @@ from hypothesis import strategies as st
 from shapely import MultiPoint, Point
 
 from asca_deploy import Detector, sample_scan_path
-from asca_deploy.around import about_ground, merge, ranges_around, turns_around, without_own_vehicle
+from asca_deploy.around import about_ground, merge, ranges_around, turns_around, widen_ranges, without_own_vehicle
+from asca_deploy.bundle import PillarBundle
+from asca_deploy.manifest import load_bundle
 from asca_deploy.open_model import RuntimeOptions, files_need_around
+from asca_deploy.shipped import shipped_bundles
 from asca_pillars.base.errors import ConfigError
 from asca_pillars.detection.detections import Detections
 from asca_pillars.geometry.boxes import corners, wrap_angle
@@ -120,6 +124,20 @@ def test_neighbours_of_different_classes_both_stay() -> None:
     first, empty = detections((10, 9, 0, 0.5, 0), (10, 9, 0, 0.9, 1)), Detections.empty(NAMES)
     merged = merge([first, empty, empty, empty], turns, 0.01)
     np.testing.assert_array_equal(merged.labels, [1, 0])  # the better first
+
+
+def test_a_wider_range_has_room_for_as_many_proposals_as_the_passes_it_replaces() -> None:
+    bundle = load_bundle(shipped_bundles()["accurate"])
+    assert isinstance(bundle, PillarBundle) and bundle.refine is not None
+    revolutions = replace(bundle, expected_input=replace(bundle.expected_input, camera_view=False))
+    wide = widen_ranges(revolutions)
+    assert isinstance(wide, PillarBundle) and wide.refine is not None
+    ahead, around = bundle.refine.seen, wide.refine.seen
+    assert around.proposals.quotas == tuple(3 * quota for quota in ahead.proposals.quotas)
+    assert around.proposals.candidates == 3 * ahead.proposals.candidates
+    assert around.keypoints.count == 3 * ahead.keypoints.count
+    assert widen_ranges(wide) == wide  # trained for every direction, its settings are those of every direction
+    assert widen_ranges(bundle) == bundle
 
 
 def test_what_a_pass_sees_far_beside_its_sector_does_not_count() -> None:

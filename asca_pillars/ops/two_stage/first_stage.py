@@ -1,6 +1,6 @@
 """First-stage results that the second stage reads: proposals, keypoints and map features at the keypoints."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -63,6 +63,17 @@ class FirstStageSettings(Strict):
 
     proposals: ProposalSettings = field(default_factory=ProposalSettings)
     keypoints: KeypointSettings = field(default_factory=KeypointSettings)
+
+    def scaled(self, factor: int) -> "FirstStageSettings":
+        """Return settings with `factor` times the proposals and keypoints, for a range with as many more objects."""
+        proposals = replace(
+            self.proposals,
+            candidates=self.proposals.candidates * factor,
+            quotas=tuple(quota * factor for quota in self.proposals.quotas),
+        )
+        return replace(
+            self, proposals=proposals, keypoints=replace(self.keypoints, count=self.keypoints.count * factor)
+        )
 
 
 @dataclass(frozen=True)
