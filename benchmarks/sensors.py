@@ -25,7 +25,7 @@ from asca_pillars.base.schema import parse
 from asca_pillars.cli.run_command import run_command
 from asca_pillars.data.kitti import KittiSplit, boxes_from_objects, objects_3d
 from asca_pillars.detection.targets import match_by_overlap
-from asca_pillars.evaluation.kitti.operating_point import wilson_interval
+from asca_pillars.evaluation.kitti.score_threshold import wilson_interval
 from asca_pillars.evaluation.recall import BEV_IOU, SMALL_BEV_IOU
 from asca_pillars.evaluation.report_page import markdown_table
 from asca_pillars.geometry.boxes import points_in_boxes

@@ -70,7 +70,7 @@ step("tracker", lambda: [Tracker()(found, 0.1 * scan, np.array(pose)) for scan i
 from asca_pillars.config.tree import AugmentConfig
 from asca_pillars.data.augment import augment
 from asca_pillars.data.frames import LabeledFrame
-from asca_pillars.data.insertion.free_placement import rays_entering
+from asca_pillars.data.insertion.insert_objects import rays_entering
 from asca_pillars.data.insertion.free_space import find_free_space
 from asca_pillars.data.kitti.calibration import in_image
 from asca_pillars.geometry.frame_change import FrameChange

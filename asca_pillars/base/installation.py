@@ -1,8 +1,10 @@
-"""The installation of this package: its source tree, its bundles, and the commands that add extras to it."""
+"""The installation of this package: its source tree, its bundles, and its optional extras."""
 
 import importlib.util
 import shlex
 from pathlib import Path
+
+from asca_pillars.base.errors import AscaError
 
 _PROJECT = 'name = "asca-pillars"'
 _FORMER_NAMES = {
@@ -51,3 +53,28 @@ def shipped_models() -> dict[str, Path]:
 def find_shipped(name: str) -> Path | None:
     """Return the folder of a model that ships, by its name or one that it had before; None if there is none."""
     return shipped_models().get(_FORMER_NAMES.get(name, name))
+
+
+EXTRAS = {
+    "train": ("torch", "lightning", "onnx", "onnxscript", "tensorboard"),
+    "openvino": ("openvino",),
+    "eval": ("matplotlib",),
+    "import": ("pyarrow",),
+    "recordings": ("rosbags", "mcap"),
+    "video": ("imageio_ffmpeg",),
+    "view": ("rerun", "rosbags", "mcap"),
+    "packets": ("velodyne_decoder", "dpkt", "ouster"),
+    "ros2": ("rclpy", "sensor_msgs", "visualization_msgs", "diagnostic_msgs"),
+    "cluster": ("ray",),
+}
+
+
+def missing_modules(extra: str) -> list[str]:
+    """Return modules of an extra that are not installed."""
+    return [name for name in EXTRAS[extra] if importlib.util.find_spec(name) is None]
+
+
+def require(extra: str) -> None:
+    """Raise AscaError that names what to install unless every module of the extra is there."""
+    if missing := missing_modules(extra):
+        raise AscaError(f"{', '.join(missing)} not installed: {install_command(extra)}")

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from asca_pillars.base.extras import require
+from asca_pillars.base.installation import require
 
 
 def average_weights(

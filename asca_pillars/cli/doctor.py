@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from asca_pillars.base.errors import AscaError
-from asca_pillars.base.extras import EXTRAS, missing_modules
-from asca_pillars.base.installation import install_command
+from asca_pillars.base.installation import EXTRAS, install_command, missing_modules
 from asca_pillars.base.system import cpu_model, own_version, package_versions
 
 if TYPE_CHECKING:

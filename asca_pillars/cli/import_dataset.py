@@ -75,7 +75,7 @@ def import_dataset(
     from rich.console import Console
 
     from asca_pillars.base.errors import ConfigError, printable
-    from asca_pillars.base.extras import require
+    from asca_pillars.base.installation import require
     from asca_pillars.base.progress import Reporter
     from asca_pillars.cli.progress import Bars
     from asca_pillars.data.importing.imported import drop_unwritable, rename_types, require_own_dataset, write_imported

@@ -4,7 +4,7 @@ from typing import Annotated
 
 import typer
 
-from asca_pillars.base.extras import require
+from asca_pillars.base.installation import require
 from asca_pillars.cli.options import ConfigArgument, DataOption, OverridesOption
 
 

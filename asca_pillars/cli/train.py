@@ -5,7 +5,7 @@ from typing import Annotated, Any
 
 import typer
 
-from asca_pillars.base.extras import require
+from asca_pillars.base.installation import require
 from asca_pillars.cli.options import ConfigArgument, DataOption, InitOption, OverridesOption
 
 INTERRUPTED = 130  # exit code of a command ended by Ctrl-C
@@ -56,7 +56,7 @@ def train(
     console = Console(markup=False)
     init = None if init is None else find_checkpoint(init)
     with console.status("Loading PyTorch"):
-        from asca_pillars.cli.run_progress import RunProgress
+        from asca_pillars.cli.progress import RunProgress
         from asca_pillars.training.callbacks import TrainingInterruptedError
         from asca_pillars.training.train import train as run_training
     options: dict[str, Any] = {"devices": devices, "num_nodes": num_nodes, "init": init}

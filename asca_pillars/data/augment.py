@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 from asca_pillars.config.tree import AugmentConfig
 from asca_pillars.data.frames import LabeledFrame, Motion
 from asca_pillars.geometry.boxes import points_in_boxes, wrap_angle
+from asca_pillars.geometry.frame_change import transform_points
 from asca_pillars.geometry.overlap import bev_intersection
-from asca_pillars.geometry.rotations import transform_points
 
 FEWEST_POINTS = 5  # kept of a cut object; with fewer it could not be detected
 WIDEST_CUT = 0.5  # fraction of an object's extent in azimuth or elevation

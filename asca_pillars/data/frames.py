@@ -1,16 +1,24 @@
-"""Labelled frames: points with their ground-truth boxes and classes."""
+"""Labelled frames: points with their ground-truth boxes and classes.
 
-from collections.abc import Iterable, Sequence
+Interface of a dataset of any layout for training, inspection, insertion and evaluation.
+
+`data.kitti.KittiSplit` reads KITTI's layout, `data.boxes.box_split.BoxSplit` the layout with boxes in the LiDAR frame
+(docs/DATA.md); `data.open_split` selects between them.
+"""
+
+from collections.abc import Container, Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from pathlib import Path
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from asca_pillars.data.labeled_split import LabeledSplit
-from asca_pillars.detection.anchors import IGNORED
+from asca_pillars.detection.spec import IGNORED
 from asca_pillars.geometry.boxes import points_in_boxes
+from asca_pillars.geometry.frame_change import FrameChange
 from asca_pillars.geometry.ranges import Ranges
+from asca_pillars.scans.mounting import Mounting
 
 # Types that KITTI's evaluation counts neither as true nor as false positives of a class.
 NEIGHBOR_TYPES = {"Car": "Van", "Pedestrian": "Person_sitting"}
@@ -54,6 +62,86 @@ class LabeledFrame:
     boxes: NDArray[np.float32]
     labels: NDArray[np.int64]
     motion: Motion = UNMOVED
+
+
+class LabeledBoxes(NamedTuple):
+    """M labelled boxes of a frame, (M, 7) float32, LiDAR frame, and the type of each."""
+
+    boxes: NDArray[np.float32]
+    types: tuple[str, ...]
+
+
+class LabeledSplit(Protocol):
+    """Frames with labelled boxes: one list of a dataset."""
+
+    @property
+    def root(self) -> str | Path:
+        """Folder of the dataset."""
+
+    @property
+    def name(self) -> str:
+        """Name of the list; "training" is every frame."""
+
+    @property
+    def pool(self) -> str:
+        """Namespace of the frame ids: lists of one pool share per-frame caches."""
+
+    @property
+    def has_camera(self) -> bool:
+        """True if objects are labelled only in a camera's field of view."""
+
+    @property
+    def mounting(self) -> Mounting:
+        """Pose of the scans' own frame in that of `points` and `labeled_boxes`, with the height if it is stated."""
+
+    @property
+    def to_sensor(self) -> FrameChange:
+        """Change from the frame of `points` to the same with the sensor at its origin, for occlusion."""
+
+    @property
+    def frame_ids(self) -> tuple[str, ...]:
+        """Sorted frame ids; DatasetError if the list is missing or invalid."""
+
+    def scan_path(self, frame_id: str) -> Path:
+        """Return the path of the frame's scan, for messages; `points` reads it."""
+
+    def input_paths(self, frame_id: str) -> tuple[Path, ...]:
+        """Return the files that the frame is read from; caches are outdated when one changes."""
+
+    def require_files(self) -> None:
+        """Raise DatasetError unless every frame has its files: training would stop at the first that lacks one."""
+
+    def points(self, frame_id: str, *, camera_view: bool) -> NDArray[np.float32]:
+        """Return (N, 4) x, y, z in m, LiDAR frame, and reflectance 0..1; with `camera_view` those in the camera's view.
+
+        Without a camera nothing is cropped.
+        """
+
+    def in_labeled_view(self, frame_id: str, positions: NDArray[np.float32]) -> NDArray[np.bool_]:
+        """Return the mask of the positions (N, 3), metres, frame of `points`, where objects are labelled."""
+
+    @property
+    def one_reflectance_scale(self) -> bool:
+        """True if `stored_points` have one scale for all scans; otherwise it is decided for each scan."""
+
+    def stored_points(self, frame_id: str) -> NDArray[np.float32]:
+        """Return all points (N, 4) of the file, possibly not finite or with a reflectance outside 0..1."""
+
+    def points_state(self, frame_id: str) -> tuple[int, ...]:
+        """Return numbers that change when `points` may change."""
+
+    def label_types(self, frame_id: str) -> list[str]:
+        """Return the type of every label, including those without a 3D box."""
+
+    def label_yaws(self, frame_id: str) -> NDArray[np.float64]:
+        """Return the stated yaw (M,), or KITTI's rotation_y, of every label with a 3D box; radians unless invalid."""
+
+    def labeled_boxes(self, frame_id: str, types: Container[str] | None = None) -> LabeledBoxes:
+        """Return the frame's boxes: those of `types`, or all that have a 3D box.
+
+        Raises:
+            DatasetError: missing or damaged labels; an object of `types` without a 3D box.
+        """
 
 
 def read_frame(

@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_pillars.data.boxes.box_split import DATASET_FILE, BoxSplit, frame_id_of
+from asca_pillars.data.frames import LabeledSplit
 from asca_pillars.data.kitti import KittiSplit, boxes_from_objects, objects_3d, read_calibration, read_labels
-from asca_pillars.data.labeled_split import LabeledSplit
 
 
 def open_split(root: str | Path, name: str = "training") -> LabeledSplit:

@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 from asca_pillars.base.errors import DatasetError
 from asca_pillars.base.progress import SILENT, Reporter
 from asca_pillars.config.tree import Config
-from asca_pillars.data.frames import other_spelling, read_frame, within_ranges
-from asca_pillars.data.labeled_split import LabeledSplit
+from asca_pillars.data.frames import LabeledSplit, other_spelling, read_frame, within_ranges
 from asca_pillars.data.yaw_units import check_yaws
 
 FRAMES_WITH_POINTS = 50

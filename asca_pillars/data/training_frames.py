@@ -9,9 +9,8 @@ import numpy as np
 from asca_pillars.base.progress import SILENT, Reporter
 from asca_pillars.config.tree import AugmentConfig, Config
 from asca_pillars.data.augment import augment
-from asca_pillars.data.frames import LabeledFrame, read_frame
+from asca_pillars.data.frames import LabeledFrame, LabeledSplit, read_frame
 from asca_pillars.data.insertion.insert_objects import Inserter, insert_objects, prepare_inserter
-from asca_pillars.data.labeled_split import LabeledSplit
 from asca_pillars.data.open_split import open_split
 from asca_pillars.detection.spec import DetectorSpec
 

@@ -10,9 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_pillars.base.errors import ConfigError, DatasetError
-from asca_pillars.base.extras import missing_modules
 from asca_pillars.base.files import atomic_directory, remove_directory, write_json
-from asca_pillars.base.installation import install_command
+from asca_pillars.base.installation import install_command, missing_modules
 from asca_pillars.base.own_files import is_own_picture, require_own_file
 from asca_pillars.base.progress import Reporter
 from asca_pillars.base.system import describe_environment
@@ -22,12 +21,11 @@ from asca_pillars.detection.spec import ScoreThresholds
 from asca_pillars.evaluation import gallery
 from asca_pillars.evaluation.arguments import Evaluation, EvaluationTask
 from asca_pillars.evaluation.curves import write_curves
-from asca_pillars.evaluation.errors.analysis import ErrorAnalysis, predictions_name, prepare_errors, report_errors
 from asca_pillars.evaluation.errors.error_frames import KittiErrorFrames
+from asca_pillars.evaluation.errors.error_report import ErrorAnalysis, predictions_name, prepare_errors, report_errors
 from asca_pillars.evaluation.kitti.average_precision import CLASS_NAMES, DIFFICULTIES, evaluate
 from asca_pillars.evaluation.kitti.kitti_report import BANDS_M, KittiReport, kitti_json, kitti_notes, kitti_tables
-from asca_pillars.evaluation.kitti.operating_point import best_scores, operating_points
-from asca_pillars.evaluation.kitti.score_threshold import matches_at_score
+from asca_pillars.evaluation.kitti.score_threshold import best_scores, matches_at_score, operating_points
 from asca_pillars.evaluation.model import Model, OpenModel, model_scores, scores_by_class
 from asca_pillars.evaluation.predictions import ScoredFrames, read_predictions, read_truth, write_predictions
 from asca_pillars.evaluation.report_files import (

@@ -16,8 +16,8 @@ from asca_pillars.base.own_files import (
     require_own,
     require_own_file,
     require_replaceable,
+    require_writable,
 )
-from asca_pillars.base.writable_file import require_writable
 from asca_pillars.evaluation import gallery
 from asca_pillars.evaluation.errors.error_report import PRODUCTS as ERROR_PRODUCTS
 from asca_pillars.evaluation.errors.error_report import remove_errors

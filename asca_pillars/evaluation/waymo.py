@@ -43,10 +43,9 @@ from asca_pillars.data.kitti import KittiSplit
 from asca_pillars.detection.detections import Detections
 from asca_pillars.detection.targets import UNMATCHED, best_assignments
 from asca_pillars.evaluation.kitti.average_precision import CLASS_NAMES
-from asca_pillars.evaluation.kitti.objects import FrameObjects
+from asca_pillars.evaluation.kitti.objects import FrameObjects, is_neighbor
 from asca_pillars.evaluation.kitti.pairs import Frames, dont_care_shares
 from asca_pillars.evaluation.kitti.score_threshold import DONT_CARE_SHARE
-from asca_pillars.evaluation.kitti.states import is_neighbor
 from asca_pillars.evaluation.predictions import FOLDED_KITTI_TYPES, ScoredFrames
 from asca_pillars.evaluation.report_page import TextTable
 from asca_pillars.geometry.boxes import points_in_boxes, wrap_angle

@@ -7,7 +7,7 @@ from asca_pillars.config.pillar import PillarModel
 from asca_pillars.config.pv_rcnn import PvRcnnModel
 from asca_pillars.config.tree import DataConfig, ModelConfig
 from asca_pillars.config.two_stage import RefineModel
-from asca_pillars.data.labeled_split import LabeledSplit
+from asca_pillars.data.frames import LabeledSplit
 from asca_pillars.models.pillar.network import build_pillar_detector
 from asca_pillars.models.pillar.preparation import PillarPreparation
 from asca_pillars.models.pv_rcnn.network import build_pv_rcnn_detector

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_pillars.base.errors import ScanError
-from asca_pillars.geometry.rotations import rotations_from_quaternions
+from asca_pillars.geometry.frame_change import rotations_from_quaternions
 from asca_pillars.scans.recordings.messages import decode_message
 from asca_pillars.scans.recordings.recording import Recording, reason
 

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Literal
 
 from asca_pillars.base.errors import ConfigError
-from asca_pillars.base.extras import require
+from asca_pillars.base.installation import require
 from asca_pillars.base.progress import Progress, Remark, Reporter
 
 FRAMES, LENGTH = 100, 100

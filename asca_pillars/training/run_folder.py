@@ -16,8 +16,7 @@ from asca_pillars.base.schema import to_dict
 from asca_pillars.base.settings import read_settings
 from asca_pillars.base.system import describe_environment
 from asca_pillars.config.tree import Config, Precision, load_config
-from asca_pillars.data.frames import read_frame
-from asca_pillars.data.labeled_split import LabeledSplit
+from asca_pillars.data.frames import LabeledSplit, read_frame
 from asca_pillars.data.training_frames import TrainingFrames
 from asca_pillars.models.checkpoint_file import weights_sha256
 from asca_pillars.scans.expected_input import ExpectedInput

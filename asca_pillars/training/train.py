@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from asca_pillars.base.extras import require
+from asca_pillars.base.installation import require
 from asca_pillars.base.progress import Progress, Remark, Reporter
 from asca_pillars.config.tree import Config, load_config
 

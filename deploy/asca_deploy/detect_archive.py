@@ -26,8 +26,8 @@ from asca_deploy.result_files import (
 )
 from asca_deploy.shipped import find_bundle
 from asca_pillars.base.errors import BundleError, ClusterError, ConfigError, ScanError
-from asca_pillars.base.extras import require
 from asca_pillars.base.files import atomic_path
+from asca_pillars.base.installation import require
 from asca_pillars.base.own_files import json_object, require_own
 from asca_pillars.base.progress import Progress, Remark, Reporter
 from asca_pillars.base.schema import to_dict

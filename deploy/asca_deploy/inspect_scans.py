@@ -16,7 +16,7 @@ from asca_deploy.manifest import load_bundle
 from asca_deploy.recordings.results import timestamp_note
 from asca_deploy.shipped import find_bundle
 from asca_pillars.base.errors import ConfigError, ScanError
-from asca_pillars.base.extras import require
+from asca_pillars.base.installation import require
 from asca_pillars.base.progress import Progress, Reporter
 from asca_pillars.data.inspection.inspect_dataset import Spread, spread
 from asca_pillars.detection.detections import ScanCounts

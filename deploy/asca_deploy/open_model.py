@@ -16,7 +16,7 @@ from asca_deploy.providers import Precision, Provider, arithmetic
 from asca_deploy.shipped import find_bundle, sample_scan_path
 from asca_deploy.tracker import WEAK_SHARE
 from asca_pillars.base.errors import ConfigError
-from asca_pillars.base.extras import require
+from asca_pillars.base.installation import require
 from asca_pillars.base.system import check_threads
 from asca_pillars.data.kitti import calibration_of_scan
 from asca_pillars.detection.detections import Detections

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from asca_deploy.bundle import BUNDLE_FOLDER, Bundle
 from asca_deploy.shipped import bundle_of_checkpoint, find_checkpoint
 from asca_pillars.base.errors import ConfigError, TrainingError
-from asca_pillars.base.extras import require
+from asca_pillars.base.installation import require
 from asca_pillars.base.own_files import require_not_input, require_replaceable
 from asca_pillars.base.progress import Progress, Reporter
 from asca_pillars.base.settings import with_overrides

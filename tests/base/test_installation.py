@@ -7,8 +7,7 @@ import tomllib
 from pathlib import Path
 
 from asca_pillars.base import installation
-from asca_pillars.base.extras import EXTRAS
-from asca_pillars.base.installation import install_command, source_tree, upgrade_advice
+from asca_pillars.base.installation import EXTRAS, install_command, source_tree, upgrade_advice
 
 ROOT = Path(__file__).parents[2]
 

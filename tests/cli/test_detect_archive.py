@@ -13,7 +13,7 @@ import pytest
 
 from asca_deploy import detect_archive as archive
 from asca_deploy.result_files import UNREADABLE_FILE
-from asca_pillars.base import extras
+from asca_pillars.base import installation
 from asca_pillars.base.errors import AscaError, BundleError, ClusterError, ConfigError, OutputError, ScanError
 from asca_pillars.base.installation import install_command
 from asca_pillars.cli.detect import detect
@@ -225,7 +225,7 @@ def test_what_cannot_be_is_refused_before_the_work(cluster: Cluster, monkeypatch
         with pytest.raises(ConfigError, match=f"--{next(iter(options))}"):
             cluster.start(**options)
     monkeypatch.undo()
-    monkeypatch.setitem(extras.EXTRAS, "cluster", ("no_such_ray",))
+    monkeypatch.setitem(installation.EXTRAS, "cluster", ("no_such_ray",))
     with pytest.raises(AscaError, match=re.escape(install_command("cluster"))):
         cluster.start()
     assert not cluster.out.exists()

@@ -20,7 +20,7 @@ from asca_deploy import find_bundle, sample_scan_path
 from asca_deploy.manifest import load_bundle
 from asca_deploy.recordings.journal import JOURNAL_FILE, Journal, ScanResult
 from asca_deploy.result_files import RUN_FILE
-from asca_pillars.base import extras
+from asca_pillars.base import installation
 from asca_pillars.base.errors import AscaError, ConfigError, OutputError, ScanError
 from asca_pillars.cli.detect import detect
 from asca_pillars.data.boxes.box_records import read_frames
@@ -373,7 +373,7 @@ def test_what_does_not_fit_is_refused_before_anything_is_detected(drive: Path, t
     with pytest.raises(ConfigError, match="need a recording"):
         run(sample_scan_path(), tmp_path / "out", topic="/lidar")
     with pytest.MonkeyPatch.context() as patch, pytest.raises(AscaError, match=r"pip install .*\[.*recordings"):
-        patch.setitem(extras.EXTRAS, "recordings", ("no_such_library",))
+        patch.setitem(installation.EXTRAS, "recordings", ("no_such_library",))
         run(drive, tmp_path / "out")
     assert list(tmp_path.iterdir()) == [other] and other.read_bytes() == drive.read_bytes() == before
     with Journal(tmp_path / "out", {}, ("Car",)), pytest.raises(OutputError, match="another `asca detect` is at work"):

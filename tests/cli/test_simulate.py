@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from asca_pillars.base import extras
+from asca_pillars.base import installation
 from asca_pillars.base.errors import AscaError, ConfigError, DatasetError, OutputError
 from asca_pillars.cli import simulate as command
 from tests.sim.report.made_up import write_set
@@ -84,7 +84,7 @@ def test_what_cannot_be_is_told_before_the_work(tmp_path: Path, monkeypatch: pyt
     for options, kind, message in cases:
         with pytest.raises(kind, match=message):
             command.simulate(out, workers=1, **options)
-    monkeypatch.setitem(extras.EXTRAS, "eval", ("no_such_plotter",))
+    monkeypatch.setitem(installation.EXTRAS, "eval", ("no_such_plotter",))
     with pytest.raises(AscaError, match=r"no_such_plotter not installed: pip install .*\[eval\]"):
         simulate(out, 2)
     assert not out.exists()

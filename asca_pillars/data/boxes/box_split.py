@@ -27,8 +27,8 @@ from asca_pillars.base.errors import ConfigError, DatasetError
 from asca_pillars.base.files import file_inside, is_hidden
 from asca_pillars.base.settings import read_settings
 from asca_pillars.data.boxes.box_records import BoxRecords, read_frame_file, read_frames, read_time, records_from
+from asca_pillars.data.frames import LabeledBoxes
 from asca_pillars.data.kitti.kitti_split import read_image_set
-from asca_pillars.data.labeled_split import LabeledBoxes
 from asca_pillars.geometry.frame_change import FrameChange
 from asca_pillars.scans.find_scans import SCAN_SUFFIXES, files_below, find_scans, visible_files
 from asca_pillars.scans.mounting import Mounting

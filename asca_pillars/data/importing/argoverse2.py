@@ -13,9 +13,8 @@ from asca_pillars.base.errors import DatasetError
 from asca_pillars.base.progress import SILENT, Reporter
 from asca_pillars.data.boxes.box_records import can_be_written, records_from
 from asca_pillars.data.boxes.box_split import BoxDataset
-from asca_pillars.data.importing.foreign_values import SkippedEntries, text_of
-from asca_pillars.data.importing.imported import Imported, ImportedFrame
-from asca_pillars.geometry.rotations import rotations_from_quaternions
+from asca_pillars.data.importing.imported import Imported, ImportedFrame, SkippedEntries, text_of
+from asca_pillars.geometry.frame_change import rotations_from_quaternions
 from asca_pillars.scans.feather import feather_table
 from asca_pillars.scans.find_scans import files_below
 

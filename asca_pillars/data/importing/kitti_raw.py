@@ -18,8 +18,7 @@ from asca_pillars.base.input_files import read_text
 from asca_pillars.base.progress import SILENT, Reporter
 from asca_pillars.data.boxes.box_records import records_from
 from asca_pillars.data.boxes.box_split import BoxDataset
-from asca_pillars.data.importing.foreign_values import SkippedEntries, numbers, text_of
-from asca_pillars.data.importing.imported import Imported, ImportedFrame
+from asca_pillars.data.importing.imported import Imported, ImportedFrame, SkippedEntries, numbers, text_of
 from asca_pillars.data.importing.kitti_tracking import LABELED_VIEW_DEG, TYPES
 from asca_pillars.scans.find_scans import files_below, visible_files
 

@@ -13,8 +13,7 @@ from asca_pillars.base.input_files import read_text
 from asca_pillars.base.progress import SILENT, Reporter
 from asca_pillars.data.boxes.box_records import BoxRecords, records_from
 from asca_pillars.data.boxes.box_split import BoxDataset
-from asca_pillars.data.importing.foreign_values import SkippedEntries
-from asca_pillars.data.importing.imported import Imported, ImportedFrame
+from asca_pillars.data.importing.imported import Imported, ImportedFrame, SkippedEntries
 from asca_pillars.data.kitti import Calibration, KittiObject, boxes_from_objects, parse_object, read_calibration
 from asca_pillars.scans.find_scans import visible_files
 

@@ -22,9 +22,8 @@ from asca_pillars.base.input_files import read_text
 from asca_pillars.base.progress import SILENT, Reporter
 from asca_pillars.data.boxes.box_records import BoxRecords, records_from
 from asca_pillars.data.boxes.box_split import BoxDataset
-from asca_pillars.data.importing.foreign_values import SkippedEntries, entry, numbers, text_of
-from asca_pillars.data.importing.imported import Imported, ImportedFrame
-from asca_pillars.geometry.rotations import rotations_from_quaternions
+from asca_pillars.data.importing.imported import Imported, ImportedFrame, SkippedEntries, entry, numbers, text_of
+from asca_pillars.geometry.frame_change import rotations_from_quaternions
 
 CHANNEL = "LIDAR_TOP"
 DETECTION_CLASSES = {

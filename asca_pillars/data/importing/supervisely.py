@@ -17,8 +17,7 @@ from pathlib import Path
 
 from asca_pillars.base.errors import DatasetError
 from asca_pillars.base.input_files import read_text
-from asca_pillars.data.importing.foreign_values import entry
-from asca_pillars.data.importing.imported import Imported
+from asca_pillars.data.importing.imported import Imported, entry
 from asca_pillars.data.importing.tool_labels import (
     COLORS,
     ScanLabels,

@@ -7,8 +7,7 @@ import json
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
-from asca_pillars.data.importing.foreign_values import entry
-from asca_pillars.data.importing.imported import Imported
+from asca_pillars.data.importing.imported import Imported, entry
 from asca_pillars.data.importing.tool_labels import (
     ScanLabels,
     ToolBox,

@@ -17,6 +17,7 @@ import numpy as np
 
 from asca_pillars.base.processes import map_in_processes
 from asca_pillars.base.progress import SILENT, Reporter
+from asca_pillars.data.frames import LabeledSplit
 from asca_pillars.data.insertion.ground_fit import (
     GROUND_BAND_M,
     LATTICE_M,
@@ -27,7 +28,6 @@ from asca_pillars.data.insertion.ground_fit import (
     order_by_cell,
 )
 from asca_pillars.data.insertion.prepared import require_writable, writable_atomic_path
-from asca_pillars.data.labeled_split import LabeledSplit
 from asca_pillars.geometry.arrays import Floating, Floats, Ints, Mask, Singles
 from asca_pillars.geometry.boxes import footprints
 from asca_pillars.geometry.common_plane import plane_heights

@@ -26,9 +26,8 @@ from numpy.typing import NDArray
 from asca_pillars.base.files import portable_name
 from asca_pillars.base.processes import map_in_processes
 from asca_pillars.base.progress import SILENT, Reporter
-from asca_pillars.data.frames import read_frame
+from asca_pillars.data.frames import LabeledSplit, read_frame
 from asca_pillars.data.insertion.prepared import require_writable, writable_atomic_path
-from asca_pillars.data.labeled_split import LabeledSplit
 from asca_pillars.geometry.boxes import points_in_boxes
 
 VERSION = 1

@@ -5,9 +5,8 @@ from collections.abc import Iterator
 from typing import Literal, NamedTuple
 
 from asca_pillars.data.frames import other_spelling
-from asca_pillars.data.inspection.box_conventions import better_convention
 from asca_pillars.data.inspection.inspect_dataset import ClassFacts, Inspection, ScanFacts
-from asca_pillars.data.inspection.measurements import InspectedSpec, input_cells
+from asca_pillars.data.inspection.measurements import InspectedSpec, better_convention, input_cells
 from asca_pillars.scans.input_check import TOLERANCE_M
 
 # Larger shares indicate an error or cost recall; KITTI and the simulator are well below all of them.

@@ -14,19 +14,20 @@ from numpy.typing import NDArray
 from asca_pillars.base.errors import DatasetError, ScanError
 from asca_pillars.base.progress import SILENT, Reporter
 from asca_pillars.config.tree import DataConfig
-from asca_pillars.data.inspection.box_conventions import ConventionFit, convention_fits
+from asca_pillars.data.frames import LabeledSplit
 from asca_pillars.data.inspection.measurements import (
+    ConventionFit,
     FrameMeasure,
     InspectedSpec,
     MatchOutcome,
     ScanMeasure,
+    convention_fits,
     input_cells,
     measure_frame,
 )
 from asca_pillars.data.kitti import KittiSplit
-from asca_pillars.data.labeled_split import LabeledSplit
 from asca_pillars.data.yaw_units import check_yaws
-from asca_pillars.detection.anchors import ClassSpec
+from asca_pillars.detection.spec import ClassSpec
 from asca_pillars.detection.targets import Assigner
 from asca_pillars.geometry.overlap import aligned_bev_iou
 from asca_pillars.scans.input_check import AxesWarning

@@ -15,7 +15,7 @@ from asca_pillars.base.errors import DatasetError
 from asca_pillars.base.files import atomic_path
 from asca_pillars.base.input_files import read_text
 from asca_pillars.geometry.boxes import corners
-from asca_pillars.geometry.rotations import transform_columns
+from asca_pillars.geometry.frame_change import transform_columns
 
 DEFAULT_IMAGE_SIZE_WH = (1242, 375)
 NEAR_PLANE_M = 0.1

@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 from asca_pillars.base.errors import DatasetError, OutputError
 from asca_pillars.base.files import atomic_path
 from asca_pillars.base.input_files import read_text, require_content
+from asca_pillars.data.frames import LabeledBoxes
 from asca_pillars.data.kitti.calibration import DEFAULT_IMAGE_SIZE_WH, Calibration, in_image, read_calibration
 from asca_pillars.data.kitti.kitti_labels import KittiObject, boxes_from_objects, objects_3d, read_labels
-from asca_pillars.data.labeled_split import LabeledBoxes
 from asca_pillars.geometry.frame_change import FrameChange
 from asca_pillars.scans.find_scans import visible_files
 from asca_pillars.scans.mounting import Mounting

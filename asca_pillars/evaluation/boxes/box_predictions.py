@@ -16,7 +16,7 @@ from asca_pillars.base.progress import SILENT, Reporter
 from asca_pillars.data.boxes.box_records import NamedRecords, json_line, read_frames, records_from
 from asca_pillars.data.boxes.box_split import BoxSplit
 from asca_pillars.data.boxes.detector_scope import DetectorScope, scope_from_json
-from asca_pillars.data.labeled_split import LabeledSplit
+from asca_pillars.data.frames import LabeledSplit
 from asca_pillars.detection.detections import Detections
 from asca_pillars.evaluation.boxes.box_pairs import EvaluatedFrame
 from asca_pillars.evaluation.predictions import shortage

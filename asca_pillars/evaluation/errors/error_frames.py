@@ -9,13 +9,18 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from asca_pillars.data.frames import LabeledSplit
 from asca_pillars.data.kitti import KittiSplit, boxes_from_objects, read_labels
-from asca_pillars.data.labeled_split import LabeledSplit
 from asca_pillars.evaluation.boxes.box_pairs import EvaluatedFrame
-from asca_pillars.evaluation.kitti.objects import FrameObjects, frame_objects
+from asca_pillars.evaluation.kitti.objects import (
+    FrameObjects,
+    KittiState,
+    detection_states,
+    frame_objects,
+    truth_states,
+)
 from asca_pillars.evaluation.kitti.pairs import Frames, dont_care_shares
 from asca_pillars.evaluation.kitti.score_threshold import DONT_CARE_SHARE
-from asca_pillars.evaluation.kitti.states import KittiState, detection_states, truth_states
 from asca_pillars.evaluation.predictions import KITTI_TYPES
 from asca_pillars.geometry.boxes import points_in_boxes
 

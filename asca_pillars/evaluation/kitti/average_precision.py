@@ -27,9 +27,8 @@ from numpy.typing import NDArray
 
 from asca_pillars.base.progress import SILENT, Reporter
 from asca_pillars.evaluation.kitti.matching import ClassStates, Counts, count
-from asca_pillars.evaluation.kitti.objects import FrameObjects
+from asca_pillars.evaluation.kitti.objects import FrameObjects, detection_states, is_neighbor, is_type, truth_states
 from asca_pillars.evaluation.kitti.pairs import Frames, Pairs, dont_care_shares, overlapping_pairs
-from asca_pillars.evaluation.kitti.states import detection_states, is_neighbor, is_type, truth_states
 
 CLASS_NAMES = ("Car", "Pedestrian", "Cyclist")
 DIFFICULTIES = ("easy", "moderate", "hard")

@@ -13,7 +13,7 @@ from asca_pillars.evaluation.kitti.average_precision import (
     KittiEvaluation,
     KittiResults,
 )
-from asca_pillars.evaluation.kitti.operating_point import OperatingPoint
+from asca_pillars.evaluation.kitti.score_threshold import OperatingPoint
 from asca_pillars.evaluation.predictions import ScoredFrames
 from asca_pillars.evaluation.report_page import TextTable
 

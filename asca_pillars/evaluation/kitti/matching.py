@@ -14,8 +14,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from asca_pillars.evaluation.kitti.objects import KittiState
 from asca_pillars.evaluation.kitti.pairs import Pairs
-from asca_pillars.evaluation.kitti.states import KittiState
 from asca_pillars.geometry.arrays import Floats, Ints, Mask
 
 

@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_pillars.base.progress import SILENT, Reporter
-from asca_pillars.evaluation.kitti.objects import FrameObjects, concatenate_frames
-from asca_pillars.evaluation.kitti.states import is_type
+from asca_pillars.evaluation.kitti.objects import FrameObjects, concatenate_frames, is_type
 from asca_pillars.geometry.overlap import paired_bev_intersection
 
 _Doubles = NDArray[np.float64]

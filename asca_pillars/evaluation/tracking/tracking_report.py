@@ -1,4 +1,7 @@
-"""Report of tracking metrics over labelled sequences: HOTA, MOTA, identity switches, fragmentations."""
+"""Report of tracking metrics over labelled sequences: HOTA, MOTA, identity switches, fragmentations.
+
+Evaluation of tracks written by `asca detect --track`.
+"""
 
 import json
 from collections import Counter
@@ -10,13 +13,17 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from asca_pillars.base.errors import DatasetError
+from asca_pillars.base.errors import ConfigError, DatasetError
 from asca_pillars.base.input_files import read_text
+from asca_pillars.base.system import describe_environment
 from asca_pillars.data.boxes.box_records import NamedRecords
 from asca_pillars.data.boxes.box_split import BoxSplit
 from asca_pillars.data.boxes.detector_scope import DetectorScope
+from asca_pillars.data.open_split import open_split
+from asca_pillars.evaluation.arguments import Evaluation, EvaluationTask
 from asca_pillars.evaluation.boxes.box_predictions import predictions_by_frame, stated_scope
-from asca_pillars.evaluation.report_page import TextTable
+from asca_pillars.evaluation.report_files import check_output_folder, write_report
+from asca_pillars.evaluation.report_page import ReportPage, TextTable
 from asca_pillars.evaluation.tracking.tracking_metrics import (
     Boxes,
     ClearMot,
@@ -260,3 +267,23 @@ def _in_order(frame_ids: Sequence[str], times: Mapping[str, float]) -> list[str]
     if all(frame_id in times for frame_id in frame_ids):
         return sorted(frame_ids, key=lambda frame_id: times[frame_id])
     return sorted(frame_ids, key=lambda frame_id: natural_order(Path(frame_id)))
+
+
+def evaluate_tracks(task: EvaluationTask) -> Evaluation:
+    """Score tracks; write the table and the JSON.
+
+    Raises:
+        AscaError: a file cannot be read, or has no identities.
+    """
+    data, predictions, split = task.data, task.predictions, task.split_name
+    assert data is not None and predictions is not None, "checked with the arguments"
+    labels = open_split(data, split)
+    if not isinstance(labels, BoxSplit):
+        raise ConfigError(f"--protocol tracking: {data} has no identities; give sequences of asca simulate --sequences")
+    check_output_folder("tracking", task.out, task.json, predictions, (data,))
+    about = {"data": str(data), "split": split, "predictions": str(predictions), "environment": describe_environment()}
+    report = tracking_report(labels, predictions, f"{predictions} against {data}, {split}", about)
+    page = ReportPage(report.subject, tracking_tables(report), tracking_notes(report))
+    content = tracking_json(report)
+    write_report("tracking", page, content, task.out, task.json, predictions)
+    return Evaluation("tracking", content, page, None, task.out)

@@ -13,9 +13,8 @@ from asca_pillars.base.progress import SILENT, Reporter
 from asca_pillars.config.tree import DataConfig
 from asca_pillars.config.two_stage import RefineConfig, RefineModel
 from asca_pillars.data.augment import move_scene
-from asca_pillars.data.frames import LabeledFrame, Motion
+from asca_pillars.data.frames import LabeledFrame, LabeledSplit, Motion
 from asca_pillars.data.insertion.prepared import prepared_folder
-from asca_pillars.data.labeled_split import LabeledSplit
 from asca_pillars.detection.detections import Detections
 from asca_pillars.models.two_stage.first_stage import open_first_stage, with_first_stage
 from asca_pillars.models.two_stage.layers import RefineInputs

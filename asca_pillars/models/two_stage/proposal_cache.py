@@ -14,8 +14,8 @@ from asca_pillars.base.errors import DatasetError
 from asca_pillars.base.processes import map_in_processes
 from asca_pillars.base.progress import SILENT, Reporter
 from asca_pillars.base.schema import to_dict
+from asca_pillars.data.frames import LabeledSplit
 from asca_pillars.data.insertion.prepared import require_writable, writable_atomic_path
-from asca_pillars.data.labeled_split import LabeledSplit
 from asca_pillars.detection.detections import Detections
 from asca_pillars.ops.two_stage.first_stage import FirstStage, FirstStageSettings, SecondStageInputs, run_first_stage
 

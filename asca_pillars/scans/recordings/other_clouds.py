@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from asca_pillars.geometry.rotations import rotations_from_quaternions, transform_points
+from asca_pillars.geometry.frame_change import rotations_from_quaternions, transform_points
 from asca_pillars.scans.recordings.messages import decode_message, decompress_message
 from asca_pillars.scans.recordings.recording import Message
 from asca_pillars.scans.records import MAX_POINTS, Field, StoredPoints, assemble_points

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_pillars.base.errors import ScanError
-from asca_pillars.base.extras import require
+from asca_pillars.base.installation import require
 from asca_pillars.scans.find_scans import visible_files
 from asca_pillars.scans.recordings.messages import decode_message
 from asca_pillars.scans.recordings.recording import Message, Recording, Topic, reason

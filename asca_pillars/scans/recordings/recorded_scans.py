@@ -5,8 +5,8 @@ from itertools import islice
 from typing import NamedTuple
 
 from asca_pillars.base.errors import ScanError
-from asca_pillars.base.extras import require
-from asca_pillars.geometry.rotations import transform_points
+from asca_pillars.base.installation import require
+from asca_pillars.geometry.frame_change import transform_points
 from asca_pillars.scans.ground_height import NamedPoints
 from asca_pillars.scans.mounting import Mounting
 from asca_pillars.scans.recordings.packet_files import OusterPackets

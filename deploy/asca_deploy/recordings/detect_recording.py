@@ -31,8 +31,8 @@ from asca_deploy.recordings.sequence_files import SequenceFiles
 from asca_deploy.result_files import ABOUT_FILE, KITTI_FILE, RUN_FILE, remove_companions, require_own_results
 from asca_deploy.tracker import Tracker
 from asca_pillars.base.errors import ConfigError, ScanError
-from asca_pillars.base.extras import require
 from asca_pillars.base.files import atomic_path
+from asca_pillars.base.installation import require
 from asca_pillars.base.progress import Progress, Remark, Reporter
 from asca_pillars.base.schema import to_dict
 from asca_pillars.data.boxes.detector_scope import DetectorScope, detector_scope

@@ -1,13 +1,17 @@
-"""Import of Waymo's parquet form: a small segment in the published columns, made here from known points."""
+"""Import of Waymo's parquet form: a small segment in the published columns, made here from known points.
+
+Points of a range image, pixel by pixel with scipy's rotations.
+"""
 
 from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from asca_pillars.base.errors import DatasetError, OutputError
 from asca_pillars.data.boxes.box_split import BoxSplit
-from asca_pillars.data.importing.waymo_parquet import read_waymo
+from asca_pillars.data.importing.waymo_parquet import LidarCalibration, range_image_points, read_waymo
 from asca_pillars.geometry.boxes import points_in_boxes
 from tests.data.importing.waymo_segment import BOX, SENSOR_M, WIDTH, range_image, write_segment
 from tests.helpers.in_process import invoke
@@ -75,3 +79,60 @@ def test_mistakes_are_named(tmp_path: Path) -> None:
     calibration.write_bytes((source / "lidar_box" / "segment.parquet").read_bytes())
     with pytest.raises(DatasetError, match=r"no column `key\.laser_name`"):
         read_waymo(source, tmp_path / "out")
+
+
+HEIGHT, COLUMNS = 3, 8
+SENSOR, PLACE_M = Rotation.from_euler("xyz", [0.05, -0.1, 0.7]), np.array([1.4, 0.2, 2.0])
+CAR, CAR_M = Rotation.from_euler("xyz", [-0.1, 0.2, 2.5]), np.array([100.0, -50.0, 3.0])
+
+
+def placed(turn: Rotation, place_m: np.ndarray) -> np.ndarray:
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = turn.as_matrix(), place_m
+    return matrix
+
+
+def drawn_image(rng: np.random.Generator) -> np.ndarray:
+    """Every other pixel has a return."""
+    image = rng.uniform(3, 40, (HEIGHT, COLUMNS, 4)).astype(np.float32)
+    image[..., 0] *= np.arange(HEIGHT * COLUMNS).reshape(HEIGHT, COLUMNS) % 2
+    return image
+
+
+def seen(image: np.ndarray, upwards_rad: np.ndarray) -> list[tuple[int, int, np.ndarray]]:
+    """Row, column and point in the vehicle's frame of each return; lasers from the lowest up."""
+    turned = np.arctan2(SENSOR.as_matrix()[1, 0], SENSOR.as_matrix()[0, 0])
+    found = []
+    for row, column in np.argwhere(image[..., 0] > 0).tolist():
+        # The first column looks straight behind the vehicle, the next ones go clockwise as seen from above.
+        azimuth = np.pi - 2 * np.pi * (column + 0.5) / COLUMNS - turned
+        ray = Rotation.from_euler("yz", [-upwards_rad[HEIGHT - 1 - row], azimuth]).apply([image[row, column, 0], 0, 0])
+        found.append((row, column, SENSOR.apply(ray) + PLACE_M))
+    return found
+
+
+@pytest.mark.parametrize("even", [False, True])
+def test_every_return_lies_on_its_beam(even: bool) -> None:
+    """Waymo gives one sensor's beams one by one, and of the others the ends of a span that is cut into even parts."""
+    low, high, image = -0.5, 0.1, drawn_image(np.random.default_rng(0))
+    upwards = np.array([low + (number + 0.5) / HEIGHT * (high - low) for number in range(HEIGHT)])
+    given = upwards if even else np.array([-0.45, -0.1, 0.05])
+    calibration = LidarCalibration(placed(SENSOR, PLACE_M), None if even else given, low, high)
+    points = range_image_points(image, calibration)
+    assert len(points) == HEIGHT * COLUMNS // 2
+    np.testing.assert_allclose(points[:, :3], [point for *_, point in seen(image, given)], atol=1e-5)
+
+
+def test_a_car_that_leans_while_it_turns_is_taken_back_to_one_time() -> None:
+    rng = np.random.default_rng(1)
+    image, upwards = drawn_image(rng), np.array([-0.4, -0.1, 0.05])
+    poses = np.concatenate(
+        [rng.uniform(-0.5, 0.5, (HEIGHT, COLUMNS, 3)), rng.uniform(-9, 9, (HEIGHT, COLUMNS, 3))], axis=2
+    )
+    calibration = LidarCalibration(placed(SENSOR, PLACE_M), upwards, 0.0, 0.0)
+    points = range_image_points(image, calibration, poses.astype(np.float32), placed(CAR, CAR_M))
+    expected = []
+    for row, column, point in seen(image, upwards):
+        turn, place_m = Rotation.from_euler("xyz", poses[row, column, :3]), poses[row, column, 3:]
+        expected.append(CAR.inv().apply(turn.apply(point) + place_m - CAR_M))
+    np.testing.assert_allclose(points[:, :3], expected, atol=1e-4)

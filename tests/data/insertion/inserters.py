@@ -4,8 +4,8 @@ import dataclasses
 
 from asca_pillars.config.pillar import PillarModel
 from asca_pillars.config.tree import Config, DataConfig, InsertConfig
+from asca_pillars.data.frames import LabeledSplit
 from asca_pillars.data.insertion.insert_objects import Inserter, prepare_inserter
-from asca_pillars.data.labeled_split import LabeledSplit
 from tests.helpers.scenes import SPEC
 
 METHODS = ("gt_aug", "rs_aug")

@@ -13,7 +13,7 @@ from asca_pillars.data.kitti import KittiObject
 from asca_pillars.evaluation.kitti.average_precision import DIFFICULTIES, METRICS, evaluate
 from asca_pillars.evaluation.kitti.kitti_report import BANDS_M, KittiReport, kitti_json, kitti_notes, kitti_tables
 from asca_pillars.evaluation.kitti.objects import FrameObjects, frame_objects
-from asca_pillars.evaluation.kitti.operating_point import best_scores, operating_points
+from asca_pillars.evaluation.kitti.score_threshold import best_scores, operating_points
 from asca_pillars.evaluation.predictions import ScoredFrames
 from asca_pillars.evaluation.report_page import ReportPage
 

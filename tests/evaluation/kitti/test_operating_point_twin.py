@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from asca_pillars.data.kitti.kitti_labels import KittiObject
-from asca_pillars.evaluation.kitti.operating_point import operating_points
+from asca_pillars.evaluation.kitti.score_threshold import operating_points
 from asca_pillars.geometry.overlap import bev_iou, iou_3d
 from tests.evaluation.kitti.scored_frames import NAMES, frame, item
 

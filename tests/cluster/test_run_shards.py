@@ -11,8 +11,7 @@ import pytest
 
 from asca_pillars.base.errors import ClusterError
 from asca_pillars.base.progress import Reporter
-from asca_pillars.cluster import ray_pool
-from asca_pillars.cluster.run_shards import run_items, run_shards
+from asca_pillars.cluster.run_shards import RayPool, connected, run_items, run_shards
 from asca_pillars.cluster.shards import Shard, make_shards, process_shards
 
 pytest.importorskip("ray", reason="needs pip install -e '.[cluster]'")
@@ -82,12 +81,12 @@ def test_all_is_done_while_a_machine_and_workers_die(cluster: Any, tmp_path: Pat
 @pytest.mark.filterwarnings("default")
 def test_machines_that_are_not_alike_are_named(cluster: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "out").mkdir()
-    with ray_pool.connected(cluster.address) as about:
+    with connected(cluster.address) as about:
         assert about.startswith("Ray: ") and about.endswith("CPUs")
-        elsewhere = ray_pool.RayPool(partial(touch, tmp_path), tmp_path / "only here")
+        elsewhere = RayPool(partial(touch, tmp_path), tmp_path / "only here")
         with pytest.raises(ClusterError, match=r"does not see .*only here; write to a folder that every"):
             list(process_shards([Shard(0, (1,))], elsewhere))
-        monkeypatch.setattr(ray_pool, "_version", lambda: "9.9")
+        monkeypatch.setattr("asca_pillars.cluster.run_shards._version", lambda: "9.9")
         (tmp_path / "only here").touch()
         with pytest.raises(ClusterError, match=r"has asca-pillars \S+, the command 9\.9; install one version"):
             list(process_shards([Shard(0, (1,))], elsewhere))
@@ -110,15 +109,15 @@ def test_each_item_is_done(cluster: Any, tmp_path: Path) -> None:
 
 @pytest.mark.filterwarnings("default")
 def test_a_job_that_no_machine_is_large_enough_for_is_noticed(cluster: Any, tmp_path: Path) -> None:
-    with ray_pool.connected(cluster.address):
-        assert ray_pool.RayPool(partial(touch, tmp_path), tmp_path, cpus=1).fits()
-        assert not ray_pool.RayPool(partial(touch, tmp_path), tmp_path, cpus=2).fits(), "two machines of one CPU"
-        assert not ray_pool.RayPool(partial(touch, tmp_path), tmp_path, gpus=1).fits()
+    with connected(cluster.address):
+        assert RayPool(partial(touch, tmp_path), tmp_path, cpus=1).fits()
+        assert not RayPool(partial(touch, tmp_path), tmp_path, cpus=2).fits(), "two machines of one CPU"
+        assert not RayPool(partial(touch, tmp_path), tmp_path, gpus=1).fits()
 
 
 def test_no_cluster_is_one_line() -> None:
     for address, reason in (("127.0.0.1:9", "refused"), ("nonsense", "Invalid address")):
         named = rf"--cluster {address}: .*{reason}.*; give HOST:PORT"
-        with pytest.raises(ClusterError, match=named) as caught, ray_pool.connected(address):
+        with pytest.raises(ClusterError, match=named) as caught, connected(address):
             pass
         assert "\n" not in str(caught.value)

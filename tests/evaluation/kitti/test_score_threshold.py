@@ -11,13 +11,13 @@ from hypothesis import strategies as st
 
 from asca_pillars.data.kitti.kitti_labels import KittiObject
 from asca_pillars.evaluation.kitti.average_precision import DIFFICULTIES
-from asca_pillars.evaluation.kitti.operating_point import (
+from asca_pillars.evaluation.kitti.score_threshold import (
     OperatingPoint,
     best_scores,
+    matches_at_score,
     operating_points,
     wilson_interval,
 )
-from asca_pillars.evaluation.kitti.score_threshold import matches_at_score
 from tests.evaluation.kitti.scored_frames import NAMES, frame, item
 
 ELSEWHERE = (400.0, 100.0, 460.0, 150.0)
