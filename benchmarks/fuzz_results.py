@@ -18,7 +18,8 @@ from asca_deploy.recordings.journal import JOURNAL_FILE, Journal, ScanResult
 from asca_deploy.recordings.rerun_file import is_own_rrd
 from asca_deploy.result_files import ResultWriter
 from asca_pillars.base.errors import AscaError, OutputError
-from asca_pillars.base.own_files import page_end, require_writable
+from asca_pillars.base.files import require_writable
+from asca_pillars.base.own_files import page_end
 from asca_pillars.base.schema import to_dict
 from asca_pillars.base.system import describe_environment
 from asca_pillars.cluster.shards import Shard, ShardFolder

@@ -12,13 +12,13 @@ import os
 import re
 import secrets
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, Literal
 
-from asca_pillars.base.errors import OutputError
-from asca_pillars.base.locks import CAN_LOCK, RETIRED, is_temporary, locked
-from asca_pillars.base.own_files import Recognizer, require_no_link, require_replaceable
+from asca_pillars.base.errors import ConfigError, OutputError
+from asca_pillars.base.locks import CAN_LOCK, RETIRED, is_temporary, locked, recover
+from asca_pillars.base.own_files import Recognizer, require_no_link, require_own_file, require_replaceable
 
 WEIGHTS_FILE: Literal["weights.ckpt"] = "weights.ckpt"
 """Trained weights alone, among the checkpoints of a run and in a bundle."""
@@ -233,3 +233,31 @@ def verify_checksum(line: bytes, key: str) -> str | None:
 
 def _digest(text: str, key: str) -> str:
     return hashlib.sha256(f"{key}\n{text}".encode()).hexdigest()[:_DIGITS]
+
+
+def require_writable(
+    path: Path | None, command: str, is_own: Recognizer, inputs: Iterable[str | Path | None] = ()
+) -> None:
+    """Make sure that a file can be written before minutes of work; None means no file.
+
+    Arguments and errors: as of `require_own_file`.
+    """
+    if path is None:
+        return
+    recover(path.parent)
+    require_own_file(path, command, is_own, inputs)
+    try:
+        with atomic_path(path):
+            raise _NotYetError
+    except _NotYetError:
+        pass
+
+
+def require_suffix(option: str, path: Path, suffix: str) -> None:
+    """Refuse a name by which a viewer would not open the file, with a ConfigError."""
+    if path.suffix.lower() != suffix:
+        raise ConfigError(f"{option} {path}: viewers open {suffix} files; choose such a name")
+
+
+class _NotYetError(Exception):
+    """Aborts a write before anything stands under the final name."""

@@ -8,8 +8,6 @@
   below the folder that the user gave, which may be a link itself.
 
 Every kind of file has a recognizer that looks at the content. `files` writes beside the final name and renames.
-
-Check of an output file before the work whose result it will hold.
 """
 
 import json
@@ -18,8 +16,7 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from asca_pillars.base.errors import ConfigError, OutputError
-from asca_pillars.base.files import atomic_path
+from asca_pillars.base.errors import OutputError
 from asca_pillars.base.locks import is_temporary, recover
 
 Recognizer: TypeAlias = Callable[[Path], bool]
@@ -232,31 +229,3 @@ def _entries(folder: Path) -> list[Path]:
     if folder.exists() and not folder.is_dir():
         raise OutputError(f"{folder}: is a file where a folder is to be written; choose another name")
     return sorted(path for path in folder.glob("*") if not is_temporary(path.name)) if folder.exists() else []
-
-
-def require_writable(
-    path: Path | None, command: str, is_own: Recognizer, inputs: Iterable[str | Path | None] = ()
-) -> None:
-    """Make sure that a file can be written before minutes of work; None means no file.
-
-    Arguments and errors: as of `require_own_file`.
-    """
-    if path is None:
-        return
-    recover(path.parent)
-    require_own_file(path, command, is_own, inputs)
-    try:
-        with atomic_path(path):
-            raise _NotYetError
-    except _NotYetError:
-        pass
-
-
-def require_suffix(option: str, path: Path, suffix: str) -> None:
-    """Refuse a name by which a viewer would not open the file, with a ConfigError."""
-    if path.suffix.lower() != suffix:
-        raise ConfigError(f"{option} {path}: viewers open {suffix} files; choose such a name")
-
-
-class _NotYetError(Exception):
-    """Aborts a write before anything stands under the final name."""

@@ -392,9 +392,9 @@ def bench(
     from asca_deploy.manifest import load_bundle
     from asca_deploy.open_model import RuntimeOptions, open_detector
     from asca_pillars.base.errors import ConfigError, ScanError
-    from asca_pillars.base.files import write_json
+    from asca_pillars.base.files import require_writable, write_json
     from asca_pillars.base.installation import require
-    from asca_pillars.base.own_files import json_object, require_own_file, require_writable
+    from asca_pillars.base.own_files import json_object, require_own_file
     from asca_pillars.base.progress import Reporter
     from asca_pillars.cli.progress import Bars
     from asca_pillars.scans.find_scans import name_scans

@@ -307,8 +307,8 @@ def _inspect_scans(data: Path, json: Path | None, **options: Any) -> None:
 
     from asca_deploy.inspect_scans import inspect_scans
     from asca_pillars.base.errors import ConfigError, PartialError, printable
-    from asca_pillars.base.files import write_json
-    from asca_pillars.base.own_files import json_object, require_own_file, require_writable
+    from asca_pillars.base.files import require_writable, write_json
+    from asca_pillars.base.own_files import json_object, require_own_file
     from asca_pillars.cli.progress import Bars
     from asca_pillars.data.boxes.box_split import DATASET_FILE
 
@@ -350,8 +350,8 @@ def _inspect_dataset(
     from rich.console import Console
 
     from asca_pillars.base.errors import ConfigError, DatasetError
-    from asca_pillars.base.files import write_json
-    from asca_pillars.base.own_files import json_object, require_own_file, require_writable
+    from asca_pillars.base.files import require_writable, write_json
+    from asca_pillars.base.own_files import json_object, require_own_file
     from asca_pillars.base.progress import Reporter
     from asca_pillars.cli.progress import Bars
     from asca_pillars.config.tree import load_config

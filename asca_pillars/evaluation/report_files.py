@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from asca_pillars.base.errors import OutputError
-from asca_pillars.base.files import remove_directory, write_json, write_text
+from asca_pillars.base.files import remove_directory, require_writable, write_json, write_text
 from asca_pillars.base.own_files import (
     Recognizer,
     ending_with,
@@ -16,7 +16,6 @@ from asca_pillars.base.own_files import (
     require_own,
     require_own_file,
     require_replaceable,
-    require_writable,
 )
 from asca_pillars.evaluation import gallery
 from asca_pillars.evaluation.errors.error_report import PRODUCTS as ERROR_PRODUCTS

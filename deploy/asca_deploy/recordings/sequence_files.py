@@ -15,9 +15,8 @@ from asca_deploy.recordings.rerun_file import RerunFile, is_own_rrd
 from asca_deploy.recordings.results import ResultFile
 from asca_deploy.recordings.video import RecordingVideo, recording_rate_hz, require_video
 from asca_deploy.result_files import COMMAND
-from asca_pillars.base.files import atomic_path
+from asca_pillars.base.files import atomic_path, require_suffix, require_writable
 from asca_pillars.base.installation import require
-from asca_pillars.base.own_files import require_suffix, require_writable
 from asca_pillars.pictures.video import VideoView
 from asca_pillars.scans.recordings.images import NearestImages
 

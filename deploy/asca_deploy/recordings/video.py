@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from asca_deploy.recordings.results import FrameResult
 from asca_deploy.result_files import COMMAND
 from asca_pillars.base.errors import ConfigError
-from asca_pillars.base.own_files import require_suffix, require_writable
+from asca_pillars.base.files import require_suffix, require_writable
 from asca_pillars.geometry.frame_change import FrameChange
 from asca_pillars.geometry.ranges import Ranges
 from asca_pillars.pictures.video import SUFFIX, BoxVideo, VideoFile, VideoView, find_encoder, is_own_video, require_view
