@@ -24,10 +24,10 @@ from asca_pillars.data.kitti import KittiSplit, boxes_from_objects, objects_3d, 
 from asca_pillars.evaluation.predictions import read_predictions, read_truth
 from asca_pillars.ops.pv_rcnn.spec import VoxelSpec
 from asca_pillars.scans.mounting import read_pose
-from asca_pillars.scans.recordings.odometry import read_poses
 from asca_pillars.scans.recordings.open_recording import open_recording
 from asca_pillars.scans.recordings.recorded_scans import RecordedScans
 from asca_pillars.scans.scan_reader import read_scan
+from asca_pillars.scans.transforms import read_poses
 from asca_pillars.sim.simulation import load_simulation_config
 from benchmarks.made_recordings import TOPIC, TYPE, point_cloud2
 from tests.helpers.scenes import write_dataset

@@ -14,8 +14,8 @@ import yaml
 from asca_deploy import Detections, sample_scan_path, shipped_bundles
 from asca_deploy.browser_page import ORT_FILES, write_page
 from asca_deploy.recordings.foxglove_file import is_own_mcap
-from asca_deploy.recordings.journal import JOURNAL_FILE, Journal, ScanResult
 from asca_deploy.recordings.rerun_file import is_own_rrd
+from asca_deploy.recordings.results import JOURNAL_FILE, Journal, ScanResult
 from asca_deploy.result_files import ResultWriter
 from asca_pillars.base.errors import AscaError, OutputError
 from asca_pillars.base.files import require_writable
@@ -34,7 +34,7 @@ from asca_pillars.evaluation.tracking.tracking_report import tracking_report
 from asca_pillars.pictures.visualize import png_bytes
 from asca_pillars.scans.scan_reader import read_scan, write_scan
 from asca_pillars.sim.simulation import require_own_frames
-from asca_pillars.training.run_files import YAML_HEAD, require_own_run
+from asca_pillars.training.run_folder import YAML_HEAD, require_own_run
 from benchmarks.fuzz_inputs import BOX, Kind
 
 CLASSES = ("Car", "Pedestrian")

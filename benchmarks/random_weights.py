@@ -27,7 +27,7 @@ from asca_pillars.base.errors import ConfigError
 from asca_pillars.cli.run_command import run_command
 from asca_pillars.config.pillar import PillarModel
 from asca_pillars.config.tree import load_config
-from asca_pillars.models.checkpoint import Checkpoint
+from asca_pillars.models.build import Checkpoint
 from asca_pillars.models.pillar.network import build_pillar_detector
 from asca_pillars.models.pillar.preparation import batch_pillars
 from asca_pillars.scans.scan_reader import read_scan

@@ -38,10 +38,10 @@ from asca_pillars.detection.detections import Detections
 from asca_pillars.evaluation.kitti.average_precision import evaluate
 from asca_pillars.evaluation.predictions import read_predictions, read_truth, write_predictions
 from asca_pillars.evaluation.report_page import markdown_table
-from asca_pillars.models.checkpoint import load_checkpoint
+from asca_pillars.models.build import load_checkpoint
 from asca_pillars.models.two_stage.first_stage import open_first_stage
 from asca_pillars.models.two_stage.network import RefineDetector, refine_logits
-from asca_pillars.models.two_stage.proposal_cache import ProposalCache
+from asca_pillars.models.two_stage.preparation import ProposalCache
 from asca_pillars.ops.two_stage.decode import Scores, refined_detections, refined_scores
 
 Refined = tuple[Detections, tuple[NDArray[np.float32], NDArray[np.float32]]]

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple, Protocol
 from asca_pillars.base.schema import to_dict
 from asca_pillars.config.pillar import PillarModel
 from asca_pillars.config.pv_rcnn import Attention, Gate, PvRcnnModel
-from asca_pillars.detection.spec import KITTI_CLASSES
+from asca_pillars.detection.anchors import KITTI_CLASSES
 from asca_pillars.ops.pv_rcnn.prepare import Deform
 
 

@@ -175,9 +175,9 @@ def time_variants(todo: Sequence[Run], family: Family, split: KittiSplit, consol
     from asca_deploy import Detector
     from asca_deploy.benchmark import alternate
     from asca_export.bundle_writer import MIN_SCANS
-    from asca_export.export import export_bundle
+    from asca_export.export_checkpoint import export_bundle
     from asca_pillars.data.frames import read_frame
-    from asca_pillars.models.checkpoint import load_checkpoint
+    from asca_pillars.models.build import load_checkpoint
 
     scans = [read_frame(split, frame_id, ()).points for frame_id in split.frame_ids[:MIN_SCANS]]
     first = {one.variant.name: one for one in reversed(todo)}  # with several seeds the first one is timed

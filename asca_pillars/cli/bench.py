@@ -33,8 +33,8 @@ from asca_deploy.benchmark import (
     measure_scaling,
     measure_throughput,
 )
-from asca_deploy.benchmark.box_differences import BoxDifference, box_difference
 from asca_deploy.benchmark.matrix import ON_THE_CPU
+from asca_deploy.benchmark.speed_comparison import BoxDifference, box_difference
 from asca_deploy.benchmark.timing import Spread
 from asca_deploy.bundle import Bundle, PillarBundle
 from asca_pillars.base.errors import ConfigError

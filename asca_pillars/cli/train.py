@@ -48,7 +48,7 @@ def train(
     from asca_deploy.shipped import find_checkpoint
     from asca_pillars.cli.progress import Bars
     from asca_pillars.config.tree import load_config
-    from asca_pillars.training.run_files import require_own_run
+    from asca_pillars.training.run_folder import require_own_run
 
     settings = load_config(config, override or ())
     require("train")

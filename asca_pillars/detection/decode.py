@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from asca_pillars.base.errors import ConfigError
 from asca_pillars.base.kernels import load_kernels
 from asca_pillars.base.strict import Strict
+from asca_pillars.detection.anchors import ANCHOR_YAWS_RAD, ClassSpec
 from asca_pillars.detection.detections import Detections
-from asca_pillars.detection.spec import ANCHOR_YAWS_RAD, ClassSpec
 from asca_pillars.geometry.boxes import DIRECTION_OFFSET_RAD, decode_boxes, wrap_angle
 
 KERNELS = "asca_pillars.geometry.nms_kernels"

@@ -10,7 +10,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from asca_pillars.detection.spec import ANCHOR_YAWS_RAD, IGNORED, ClassSpec
+from asca_pillars.detection.anchors import ANCHOR_YAWS_RAD, IGNORED, ClassSpec
 from asca_pillars.geometry.boxes import DIRECTION_OFFSET_RAD, encode_boxes, points_in_boxes
 from asca_pillars.geometry.overlap import aligned_bev_iou
 

@@ -21,8 +21,8 @@ from asca_pillars.detection.spec import ScoreThresholds
 from asca_pillars.evaluation import gallery
 from asca_pillars.evaluation.arguments import Evaluation, EvaluationTask
 from asca_pillars.evaluation.curves import write_curves
+from asca_pillars.evaluation.errors.analysis import ErrorAnalysis, predictions_name, prepare_errors, report_errors
 from asca_pillars.evaluation.errors.error_frames import KittiErrorFrames
-from asca_pillars.evaluation.errors.error_report import ErrorAnalysis, predictions_name, prepare_errors, report_errors
 from asca_pillars.evaluation.kitti.average_precision import CLASS_NAMES, DIFFICULTIES, evaluate
 from asca_pillars.evaluation.kitti.kitti_report import BANDS_M, KittiReport, kitti_json, kitti_notes, kitti_tables
 from asca_pillars.evaluation.kitti.score_threshold import best_scores, matches_at_score, operating_points

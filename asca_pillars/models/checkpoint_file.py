@@ -15,7 +15,7 @@ from asca_pillars.base.files import WEIGHTS_FILE, atomic_path
 from asca_pillars.base.input_files import require_content
 from asca_pillars.base.schema import parse
 from asca_pillars.config.tree import Config
-from asca_pillars.scans.expected_input import ExpectedInput
+from asca_pillars.scans.input_check import ExpectedInput
 
 
 class CheckpointFile(NamedTuple):

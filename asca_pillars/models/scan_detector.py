@@ -14,7 +14,7 @@ from asca_pillars.data.frames import LabeledFrame
 from asca_pillars.detection.detections import Detections
 from asca_pillars.detection.spec import DetectorSpec
 from asca_pillars.geometry.frame_change import FrameChange
-from asca_pillars.models.checkpoint import load_checkpoint
+from asca_pillars.models.build import load_checkpoint
 from asca_pillars.models.trainable import Trainable, to_device
 from asca_pillars.scans.mounting import Mounting
 

@@ -10,7 +10,7 @@ from asca_pillars.base.own_files import json_object, require_replaceable
 from asca_pillars.config.tree import Config
 from asca_pillars.data.frames import LabeledFrame, Motion, within_ranges
 from asca_pillars.data.training_frames import TrainingFrames, open_frames
-from asca_pillars.detection.spec import IGNORED
+from asca_pillars.detection.anchors import IGNORED
 from asca_pillars.pictures.drawing import BoxLayer, Image
 from asca_pillars.pictures.visualize import class_color, draw_layers, write_png
 

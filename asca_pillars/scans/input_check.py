@@ -1,17 +1,60 @@
 """Comparison of a scan with the training scans, and a check of its axes; each warning names the option to set.
 
 A wrong reflectance scale, sensor height or axis degrades detection without an error; here it gives a warning.
+
+Statistics of the training scans, stored in the bundle for `input_check`.
+
+Statistics of training scans for the bundle.
 """
 
+from collections.abc import Iterable
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
+from asca_pillars.base.errors import ConfigError
+from asca_pillars.base.strict import Strict
 from asca_pillars.detection.detections import ScanCounts
 from asca_pillars.geometry.arrays import Floating, Mask, Singles
 from asca_pillars.geometry.ranges import Ranges
-from asca_pillars.scans.expected_input import ExpectedInput
 from asca_pillars.scans.mounting import Mounting
+
+_HIGHEST_M = 100.0  # larger heights of the ground are not plausible
+
+
+@dataclass(frozen=True)
+class ExpectedInput(Strict):
+    """Statistics of the training scans: (lowest, highest) over scans."""
+
+    points_per_scan: tuple[int, int]
+    """Finite points of a scan, cropped to the camera's view if `camera_view`."""
+    reflectance_mean: tuple[float, float]
+    """Mean reflectance of a scan, 0..1."""
+    ground_z_m: tuple[float, float] | None
+    """Height of the ground near the sensor, LiDAR frame, metres (minus the sensor's height); None if no scan
+    showed the ground."""
+    camera_view: bool
+    """True if the scans were cropped to the points in the camera's image."""
+
+    def __post_init__(self) -> None:
+        for name, low, high in (
+            ("points_per_scan", 0, 2**53),
+            ("reflectance_mean", 0, 1),
+            ("ground_z_m", -_HIGHEST_M, _HIGHEST_M),
+        ):
+            ends = getattr(self, name)
+            if ends is not None and not low <= ends[0] <= ends[1] <= high:
+                raise ConfigError(
+                    f"expected_input.{name} = {list(ends)}: must be lowest and highest in {low:g}..{high:g}"
+                )
+
+    @property
+    def sensor_height_m(self) -> float | None:
+        """Height of the sensor above the ground in the middle of those scans; None where no scan showed it."""
+        return None if self.ground_z_m is None else -sum(self.ground_z_m) / 2
+
 
 OUTSIDE_SHARE = 0.95
 FAR_M, FAR_SHARE = 1000.0, 0.05
@@ -312,3 +355,24 @@ def _percentile(ordered: Floating, percent: float) -> float:
     place, part = divmod(percent / 100 * (len(ordered) - 1), 1)
     low, high = float(ordered[int(place)]), float(ordered[min(int(place) + 1, len(ordered) - 1)])
     return low + part * (high - low)
+
+
+def measure_expected_input(scans: Iterable[NDArray[np.float32]], camera_view: bool) -> ExpectedInput:
+    """Measure training scans.
+
+    Args:
+        scans: each (N, 4) x, y, z in metres, LiDAR frame, and reflectance 0..1, empty ones are left out; as the
+            network gets them before augmentation, hence cropped if `camera_view`. Read once, one after the other.
+        camera_view: whether they are cropped to the camera's image.
+
+    Raises:
+        ValueError: there is no scan with a point.
+    """
+    measured = [(len(points), float(points[:, 3].mean()), ground_z_m(points)) for points in scans if len(points)]
+    grounds = [ground for _, _, ground in measured if ground is not None]
+    return ExpectedInput(
+        points_per_scan=(min(m[0] for m in measured), max(m[0] for m in measured)),
+        reflectance_mean=(min(m[1] for m in measured), max(m[1] for m in measured)),
+        ground_z_m=(min(grounds), max(grounds)) if grounds else None,
+        camera_view=camera_view,
+    )

@@ -12,12 +12,11 @@ from numpy.typing import NDArray
 from asca_pillars.base.errors import ScanError
 from asca_pillars.base.files import atomic_path
 from asca_pillars.base.input_files import require_content
-from asca_pillars.scans.arrays import read_npy
 from asca_pillars.scans.feather import read_feather
 from asca_pillars.scans.find_scans import SCAN_SUFFIXES
 from asca_pillars.scans.pcd import read_pcd
 from asca_pillars.scans.ply import read_ply
-from asca_pillars.scans.records import AGAIN, MAX_POINTS, StoredPoints
+from asca_pillars.scans.records import AGAIN, MAX_POINTS, StoredPoints, read_npy
 
 ReflectanceScale = Literal["auto"] | float
 """Stored value that is a reflectance of 1: 1, 100, 255, 65535, any other positive number, or auto."""

@@ -17,8 +17,7 @@ from asca_pillars.base.files import atomic_path
 from asca_pillars.base.input_files import require_content
 from asca_pillars.config.pv_rcnn import PvRcnnModel
 from asca_pillars.config.tree import Config, ModelConfig
-from asca_pillars.models.build import build_model
-from asca_pillars.models.checkpoint import load_checkpoint
+from asca_pillars.models.build import build_model, load_checkpoint
 from asca_pillars.models.checkpoint_file import read_failure, read_plain, require_same_arrays
 
 LAST, PREVIOUS, BEST = "last.ckpt", "previous.ckpt", "best.ckpt"

@@ -17,8 +17,8 @@ from asca_pillars.base.schema import to_dict
 from asca_pillars.config.tree import Config, Precision, TrainConfig
 from asca_pillars.evaluation.recall import RecallTally
 from asca_pillars.models.build import build_model
-from asca_pillars.models.pillar.distillation import Distillation
-from asca_pillars.scans.expected_input import ExpectedInput
+from asca_pillars.models.pillar.trained import Distillation
+from asca_pillars.scans.input_check import ExpectedInput
 from asca_pillars.training.dataset import Batch
 
 

@@ -15,8 +15,7 @@ from importlib import resources
 from pathlib import Path
 
 from asca_deploy.bundle import MANIFEST
-from asca_deploy.manifest import load_pillar_bundle
-from asca_deploy.manifest_file import read_manifest
+from asca_deploy.manifest import load_pillar_bundle, read_manifest
 from asca_pillars.base.errors import BundleError, ConfigError
 from asca_pillars.base.files import atomic_directory, atomic_path, write_json
 from asca_pillars.base.input_files import require_content

@@ -24,7 +24,7 @@ from asca_pillars.ops.pv_rcnn.spec import VoxelSpec
 from asca_pillars.ops.two_stage.decode import Scores
 from asca_pillars.ops.two_stage.first_stage import FirstStageSettings
 from asca_pillars.ops.two_stage.prepare import RefineSettings
-from asca_pillars.scans.expected_input import ExpectedInput
+from asca_pillars.scans.input_check import ExpectedInput
 
 SCHEMA_VERSION = 3
 MANIFEST = "bundle.json"

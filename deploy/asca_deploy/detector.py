@@ -1,4 +1,7 @@
-"""Detector without PyTorch, with the steps around the pipeline that all detector families share."""
+"""Detector without PyTorch, with the steps around the pipeline that all detector families share.
+
+Choice of the pipeline for a bundle, by its family, and of its provider.
+"""
 
 import logging
 import weakref
@@ -13,22 +16,65 @@ from numpy.typing import NDArray
 
 from asca_deploy import auto, providers
 from asca_deploy.around import about_ground, merge, ranges_around, turns_around, widen_ranges, without_own_vehicle
-from asca_deploy.bundle import Bundle, weights_digest
+from asca_deploy.bundle import Bundle, PillarBundle, PvRcnnBundle, weights_digest
 from asca_deploy.manifest import load_bundle
-from asca_deploy.open_pipeline import open_pipeline
 from asca_deploy.ort_session import check_onnxruntime
-from asca_deploy.pipeline import StageTimes
+from asca_deploy.pillar.pipeline import PillarPipeline
+from asca_deploy.pipeline import Pipeline, StageTimes
+from asca_deploy.pv_rcnn.pipeline import PvRcnnPipeline
 from asca_deploy.scan_detections import ScanDetections
-from asca_deploy.shipped import find_bundle
+from asca_deploy.shipped import find_bundle, sample_scan_path
 from asca_deploy.stream import overlap_stages
+from asca_deploy.two_stage.pipeline import RefinePipeline
 from asca_pillars.base.errors import ConfigError, ScanError
 from asca_pillars.base.kernels import load_kernels
 from asca_pillars.base.system import check_threads, own_version
 from asca_pillars.detection import decode
-from asca_pillars.detection.detections import FrameReport, ScanCounts, sum_counts
+from asca_pillars.detection.detections import Detections, FrameReport, ScanCounts, sum_counts
 from asca_pillars.geometry.frame_change import FrameChange
 from asca_pillars.scans.input_check import InputWarning, check_input
 from asca_pillars.scans.mounting import Mounting
+from asca_pillars.scans.scan_reader import read_scan
+
+
+def open_pipeline(
+    folder: Path,
+    bundle: Bundle,
+    provider: providers.Provider | Literal["auto"],
+    precision: providers.Precision | None,
+    threads: int,
+) -> auto.Choice[Pipeline[Any, Any]]:
+    """Open the pipeline of a bundle's family on a provider or, with auto, on the fastest that agrees.
+
+    Args:
+        folder: of the bundle.
+        bundle: its manifest, verified by `load_bundle`.
+        provider, threads: of the slowest network.
+        precision: None for float32, with auto for any.
+
+    Raises:
+        BundleError: a graph cannot be run or does not match the manifest.
+        ProviderError: the provider does not start or cannot run the graph; with auto, none can be taken.
+    """
+
+    def open_on(name: providers.Provider, digits: providers.Precision) -> Pipeline[Any, Any]:
+        if isinstance(bundle, PvRcnnBundle):
+            return PvRcnnPipeline(folder, bundle, name, digits, threads)
+        assert isinstance(bundle, PillarBundle), "there are no other kinds"
+        family = PillarPipeline if bundle.kind == "pillar" else RefinePipeline
+        return family(folder, bundle, name, digits, threads)
+
+    if provider != providers.AUTO:
+        digits = precision or "float32"
+        return auto.Choice(open_on(provider, digits), provider, digits, ())
+    points = read_scan(sample_scan_path()).points
+
+    def detect(pipeline: Pipeline[Any, Any]) -> Detections:
+        stage_times: StageTimes = []
+        return pipeline.finish(pipeline.infer(pipeline.prepare(points, stage_times), stage_times), stage_times)
+
+    return auto.choose(providers.available(), open_on, detect, bundle.spec, precision, weights=bundle.precision)
+
 
 _log = logging.getLogger("asca_pillars")
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from asca_deploy.bundle import PillarBundle
 from asca_deploy.detector import Detector
-from asca_deploy.pillar.backbone import HeadOutputs
+from asca_deploy.pillar.graphs import HeadOutputs
 from asca_deploy.pillar.pipeline import Canvas, PillarPipeline
 from asca_deploy.two_stage.pipeline import RefinePipeline, refine_inputs
 from asca_pillars.base.errors import BundleError

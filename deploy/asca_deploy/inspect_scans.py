@@ -22,10 +22,9 @@ from asca_pillars.data.inspection.inspect_dataset import Spread, spread
 from asca_pillars.detection.detections import ScanCounts
 from asca_pillars.geometry.frame_change import FrameChange
 from asca_pillars.geometry.ranges import Ranges
-from asca_pillars.scans.expected_input import ExpectedInput
 from asca_pillars.scans.find_scans import name_scans
 from asca_pillars.scans.ground_height import HeightEstimate, NamedPoints
-from asca_pillars.scans.input_check import check_input, ground_z_m
+from asca_pillars.scans.input_check import ExpectedInput, check_input, ground_z_m
 from asca_pillars.scans.mounting import Mounting
 from asca_pillars.scans.recordings.open_recording import is_recording, open_recording
 from asca_pillars.scans.recordings.recorded_scans import RecordedScan, RecordedScans

@@ -2,13 +2,21 @@
 
 A manifest that does not belong to its graphs would move boxes without any error. So everything that boxes depend on
 is also in the metadata of each graph, under the graph's SHA-256, and the two have to agree.
+
+bundle.json as a file: reading its JSON, and checking that every value was taken as written.
+
+Checks of an ONNX file before a backend opens it, read without the package `onnx`.
+
+The file is a protobuf message (https://github.com/onnx/onnx/blob/main/onnx/onnx.proto); only the few fields below are
+read, others are skipped.
 """
 
 import hashlib
 import json
-from collections.abc import Iterable
+import reprlib
+from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,21 +24,203 @@ from numpy.typing import NDArray
 from asca_deploy.bundle import (
     MANIFEST,
     PILLAR_GRAPHS,
+    SCHEMA_VERSION,
     Bundle,
     GraphFile,
     PillarBundle,
     PvRcnnBundle,
 )
-from asca_deploy.manifest_file import EXPORT_AGAIN, LONGEST_REASON, first_parsing_difference, read_manifest
-from asca_deploy.onnx_file import has_external_data, read_metadata
 from asca_pillars.base.errors import AscaError, BundleError, printable
 from asca_pillars.base.files import write_json
 from asca_pillars.base.input_files import require_content
+from asca_pillars.base.installation import upgrade_advice
 from asca_pillars.base.schema import parse, to_dict
-from asca_pillars.detection.spec import ANCHOR_YAWS_RAD
+from asca_pillars.detection.anchors import ANCHOR_YAWS_RAD
 from asca_pillars.geometry.boxes import DIRECTION_OFFSET_RAD
 from asca_pillars.ops.pillar.prepare import FEATURES
 from asca_pillars.ops.pillar.spec import PillarSpec
+
+EXPORT_AGAIN = "export the bundle again with `asca export`"
+LONGEST_REASON = 300
+"""Characters of a damaged file's own words in a message."""
+
+_LARGEST_BYTES = 1 << 20
+
+
+def read_manifest(manifest: Path) -> dict[str, Any]:
+    """Read the keys and values of a bundle.json of a supported schema; BundleError if it is none."""
+    try:
+        require_content(manifest, BundleError)
+        if manifest.stat().st_size > _LARGEST_BYTES:
+            raise BundleError(f"{manifest} is larger than a manifest ever is (1 MiB); {EXPORT_AGAIN}")
+        text = manifest.read_text(encoding="utf-8-sig")
+        data = json.loads(text, object_pairs_hook=_without_duplicates, parse_constant=_no_number)
+    except (FileNotFoundError, NotADirectoryError):
+        refuse_run_folder(manifest.parent)
+        raise BundleError(
+            f"{manifest.parent} is not a model bundle, it holds no {MANIFEST}; make one with `asca export`"
+        ) from None
+    except OSError as error:
+        raise BundleError(f"{manifest}: {error.strerror}") from None
+    except RecursionError:
+        raise BundleError(f"{manifest} is damaged (nested too deeply); {EXPORT_AGAIN}") from None
+    except ValueError as error:  # invalid JSON or UTF-8
+        raise BundleError(f"{manifest} is damaged ({printable(str(error), LONGEST_REASON)}); {EXPORT_AGAIN}") from None
+    version = data.get("schema_version") if isinstance(data, dict) else None
+    if type(version) is not int:
+        version_text = reprlib.repr(version)
+        raise BundleError(f"{manifest} is not a bundle's manifest: `schema_version` is {version_text}; {EXPORT_AGAIN}")
+    if version > SCHEMA_VERSION:
+        raise BundleError(
+            f"{manifest}: schema_version {reprlib.repr(version)} is newer than {SCHEMA_VERSION}, which this version "
+            f"reads; {upgrade_advice()}"
+        )
+    if version < SCHEMA_VERSION:
+        raise BundleError(f"{manifest}: schema_version {reprlib.repr(version)} is no longer read; {EXPORT_AGAIN}")
+    return dict(data)
+
+
+def first_parsing_difference(written: Any, understood: Any) -> str | None:
+    """Return the path of the first value that was not taken as it is written, such as true for 1 or a default; or None.
+
+    A key that is understood as None need not be written: bundles made before there was such a key lack it.
+    """
+    if isinstance(understood, dict):
+        if not isinstance(written, dict):
+            return "*"
+        for key, value in understood.items():
+            if key not in written and value is None:
+                continue
+            if key not in written:
+                return str(key)
+            if inner := first_parsing_difference(written[key], value):
+                return key if inner == "*" else f"{key}.{inner}"
+        return None
+    if isinstance(understood, list):
+        if not isinstance(written, list) or len(written) != len(understood):
+            return "*"
+        for index, (ours, theirs) in enumerate(zip(written, understood, strict=True)):
+            if inner := first_parsing_difference(ours, theirs):
+                return str(index) if inner == "*" else f"{index}.{inner}"
+        return None
+    if isinstance(understood, float) and type(written) is int:
+        return None if written == understood else "*"
+    return None if type(written) is type(understood) and written == understood else "*"
+
+
+def refuse_run_folder(folder: Path) -> None:
+    """Raise BundleError, which names the checkpoint, if it is the folder of a training run."""
+    last = folder / "checkpoints" / "last.ckpt"
+    if last.is_file():
+        raise BundleError(f"{folder} is the folder of a training run, no model bundle; give its checkpoint, {last}")
+
+
+def _without_duplicates(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        twice = next(key for number, (key, _) in enumerate(pairs) if key in dict(pairs[:number]))
+        raise ValueError(f"key `{printable(twice, LONGEST_REASON)}` is there twice")
+    return found
+
+
+def _no_number(word: str) -> Any:
+    raise ValueError(f"{word} is not a number")
+
+
+_Message: TypeAlias = memoryview
+
+_VARINT, _FIXED64, _BYTES, _FIXED32 = 0, 1, 2, 5  # protobuf's wire types
+_FIXED_BYTES = {_FIXED64: 8, _FIXED32: 4}
+_DEEPEST = 64  # graphs within graphs
+
+# Field numbers of onnx.proto: which fields of a message lead to tensors, and to which kind of message.
+_MODEL_METADATA = 14
+_ENTRY_KEY, _ENTRY_VALUE = 1, 2
+_TENSOR_EXTERNAL_DATA, _TENSOR_DATA_LOCATION = 13, 14
+_WAYS_TO_TENSORS = {
+    "model": {7: "graph", 25: "function"},
+    "graph": {1: "node", 5: "tensor", 15: "sparse"},
+    "function": {7: "node", 11: "attribute"},
+    "node": {5: "attribute"},
+    "attribute": {5: "tensor", 6: "graph", 10: "tensor", 11: "graph", 22: "sparse", 23: "sparse"},
+    "sparse": {1: "tensor", 2: "tensor"},
+}
+
+
+def read_metadata(model: bytes) -> dict[str, str]:
+    """Return the `metadata_props` of a model.
+
+    Raises:
+        ValueError: this is not an ONNX file.
+    """
+    found = {}
+    for number, value in _fields(memoryview(model)):
+        if number == _MODEL_METADATA and isinstance(value, memoryview):
+            entry = {key: bytes(text).decode() for key, text in _fields(value) if isinstance(text, memoryview)}
+            found[entry.get(_ENTRY_KEY, "")] = entry.get(_ENTRY_VALUE, "")
+    return found
+
+
+def has_external_data(model: bytes) -> bool:
+    """Return whether any tensor of a model lies in another file.
+
+    Raises:
+        ValueError: this is not an ONNX file.
+    """
+    return _leads_outside(memoryview(model), "model", _DEEPEST)
+
+
+def _leads_outside(message: _Message, kind: str, depth: int) -> bool:
+    if not depth:
+        raise ValueError("graphs are nested too deeply")
+    if kind == "tensor":
+        return any(
+            number == _TENSOR_EXTERNAL_DATA or (number == _TENSOR_DATA_LOCATION and value == 1)
+            for number, value in _fields(message)
+        )
+    ways = _WAYS_TO_TENSORS[kind]
+    return any(
+        isinstance(value, memoryview) and _leads_outside(value, ways[number], depth - 1)
+        for number, value in _fields(message)
+        if number in ways
+    )
+
+
+def _fields(message: _Message) -> Iterator[tuple[int, int | memoryview]]:
+    """Yield number and value of each field: an int, or the bytes of a string, a packed list or a message."""
+    place = 0
+    while place < len(message):
+        tag, place = _varint(message, place)
+        number, wire = tag >> 3, tag & 7
+        if wire == _VARINT:
+            value, place = _varint(message, place)
+            yield number, value
+            continue
+        if wire == _BYTES:
+            size, place = _varint(message, place)
+        elif wire in _FIXED_BYTES:
+            size = _FIXED_BYTES[wire]
+        else:
+            raise ValueError(f"not an ONNX file: wire type {wire}")
+        if size > len(message) - place:
+            raise ValueError("not an ONNX file: it ends within a field")
+        yield number, message[place : place + size]
+        place += size
+
+
+def _varint(message: _Message, place: int) -> tuple[int, int]:
+    """Return the number that starts at `place`, and where it ends."""
+    value = 0
+    for shift in range(0, 70, 7):
+        if place >= len(message):
+            raise ValueError("not an ONNX file: it ends within a number")
+        byte = message[place]
+        place += 1
+        value |= (byte & 0x7F) << shift
+        if byte < 0x80:
+            return value, place
+    raise ValueError("not an ONNX file: a number has no end")
+
 
 ESSENTIALS = ("schema_version", "kind", "name", "license", "precision", "spec", "pillar")
 """Keys of bundle.json that are stamped into every graph's metadata, each as JSON."""

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_deploy.scan_detections import ScanDetections
-from asca_deploy.tracks import Tracks
+from asca_deploy.tracker import Tracks
 from asca_pillars.base.errors import AscaError, DatasetError
 from asca_pillars.base.files import atomic_path, write_json, write_text
 from asca_pillars.base.input_files import require_content

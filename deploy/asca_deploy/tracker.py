@@ -4,21 +4,64 @@ Each track is a Kalman filter over position and velocity on the ground, with whi
 Kirubarajan, Estimation with Applications to Tracking and Navigation, 6.3); x and y share one covariance, as motion and
 measurement are isotropic. The confidence of a track is a score that detections raise and time lowers (Benbarka et al.,
 Score refinement for confidence-based 3D multi-object tracking, IROS 2021).
+
+Result of tracking: the boxes of one scan with identities and velocities.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from asca_deploy.tracks import Tracks
 from asca_pillars.base.errors import ConfigError
-from asca_pillars.detection.detections import Detections
+from asca_pillars.detection.detections import Detection, Detections
 from asca_pillars.detection.targets import UNMATCHED, best_assignments
 from asca_pillars.geometry.frame_change import FrameChange, is_rigid
 from asca_pillars.geometry.overlap import paired_bev_intersection
+
+_DIGITS = 4
+
+
+class Track(NamedTuple):
+    """One tracked box: detection, identity, and velocity along the scan's x and y."""
+
+    track_id: int
+    detection: Detection
+    vx_mps: float
+    vy_mps: float
+
+
+@dataclass(frozen=True, eq=False)
+class Tracks:
+    """N tracked boxes of one scan, best first. Iterate for `Track` records."""
+
+    detections: Detections
+    """N boxes as they were detected, in the frame of the scan."""
+    track_ids: NDArray[np.int64]
+    """(N,) identity of each object, the same from scan to scan; numbers are never reused."""
+    velocities_mps: NDArray[np.float64]
+    """(N, 2) along the scan's x and y: over ground if the tracker gets the vehicle's pose, else relative to it."""
+
+    def __len__(self) -> int:
+        return len(self.detections)
+
+    def __iter__(self) -> Iterator[Track]:
+        for number, found, (vx, vy) in zip(
+            self.track_ids.tolist(), self.detections, self.velocities_mps.tolist(), strict=True
+        ):
+            yield Track(number, found, vx, vy)
+
+    def to_dicts(self) -> list[dict[str, str | float]]:
+        """Return `Detections.to_dicts` with `track_id`, `vx_mps` and `vy_mps` in each."""
+        return [
+            found
+            | {"track_id": track.track_id, "vx_mps": round(track.vx_mps, _DIGITS)}
+            | {"vy_mps": round(track.vy_mps, _DIGITS)}
+            for found, track in zip(self.detections.to_dicts(), self, strict=True)
+        ]
+
 
 _Doubles = NDArray[np.float64]
 _Integers = NDArray[np.int64]

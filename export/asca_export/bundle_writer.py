@@ -18,9 +18,9 @@ from asca_pillars.base.errors import ExportError
 from asca_pillars.base.files import WEIGHTS_FILE
 from asca_pillars.base.system import cpu_model, git_revision, package_versions
 from asca_pillars.detection.spec import DetectorSpec
-from asca_pillars.models.checkpoint import Checkpoint
+from asca_pillars.models.build import Checkpoint
 from asca_pillars.models.checkpoint_file import save_weights, weights_sha256
-from asca_pillars.scans.measure_input import measure_expected_input
+from asca_pillars.scans.input_check import measure_expected_input
 
 MIN_SCANS = 8
 LICENSE = "Apache-2.0"

@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 
 from asca_deploy.bundle import Parity
-from asca_deploy.pillar.backbone import Maps
+from asca_deploy.pillar.graphs import Maps
 from asca_deploy.pillar.pipeline import Canvas, PillarPipeline
 from asca_export.pillar.masked_forms import NEVER
 from asca_pillars.base.errors import ExportError

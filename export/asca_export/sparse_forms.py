@@ -3,27 +3,148 @@
 A batch normalization is part of the weights before it. A convolution by table reads the rows of its taps side by side,
 so it is one product; an upsampling whose kernel equals its stride is one product for each active parent, whose
 outputs are then picked at head cells; the head's three convolutions are one product.
+
+Convolutions by table in ONNX: for each layer Concat (row of zeros), Gather, Reshape, Gemm, Relu.
+
+In 8 bits all rows are uint8 from one Gemm to the next. Gemm stands between DequantizeLinear and QuantizeLinear, which
+runtimes join into one integer operator; the quantization's zero point is the ReLU.
+
+The sparse backbone in 8 bits, as `quantize` does it for the dense one; here no empty space has to be rounded.
+
+A channel's step is its largest value on the calibration scans / 255. Weights are rounded together (GPTQ), and the bias
+makes up for what rounding changes in the mean. The head's weights are rounded for the cells with the highest scores,
+which boxes are decoded from.
 """
 
-from collections.abc import Collection, Iterator, Sequence
+import copy
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple, Protocol, TypeVar
 
 import numpy as np
+import onnx
 import torch
 from numpy.typing import NDArray
-from onnx import TensorProto, helper
+from onnx import TensorProto, helper, numpy_helper
 from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from asca_deploy.pillar.graphs import PILLAR_FEATURES
 from asca_export.fast_forms import STEP_VALUE, CanvasSteps
-from asca_export.quantize import HEAD
-from asca_export.row_graphs import RowGraph
+from asca_export.graphs import OPSET
+from asca_export.quantize import HEAD, PLACES, STEPS, TINY, WEIGHT_STEPS, round_together
 from asca_pillars.detection.decode import HeadMaps
 from asca_pillars.models.pillar.neck import SparseRPNNeck, block_layers
 from asca_pillars.models.pillar.network import PillarDetector
 from asca_pillars.ops.pillar.neck_rulebooks import SAME, NeckRulebooks, rulebook_inputs
+
+_TINY = 1e-12
+
+
+class RowGraph:
+    """Builder of a graph's nodes and constants; methods return the name of their result.
+
+    Args:
+        product: a layer's weights by its name, rounded already for those of `eight_bit`.
+        eight_bit: products that compute in 8 bits.
+    """
+
+    def __init__(self, product: Callable[[str], nn.Linear], eight_bit: Collection[str]) -> None:
+        self._product, self._eight_bit = product, frozenset(eight_bit)
+        self._nodes: list[onnx.NodeProto] = []
+        self._constants: dict[str, NDArray[Any]] = {}
+        self._inputs: dict[str, onnx.ValueInfoProto] = {}
+        self._outputs: list[onnx.ValueInfoProto] = []
+
+    def add_input(self, name: str, kind: int, rows: str, width: int | None = None) -> str:
+        """Declare an input (rows, width), or (rows,)."""
+        self._inputs[name] = helper.make_tensor_value_info(name, kind, [rows] if width is None else [rows, width])
+        return name
+
+    def add_output(self, name: str, kind: int, rows: str, width: int) -> None:
+        """Declare a node's result (rows, width) an output."""
+        self._outputs.append(helper.make_tensor_value_info(name, kind, [rows, width]))
+
+    def gather(self, owner: str, rows: str, missing: NDArray[Any], table: str, taps: int) -> str:
+        """Gather unitless rows by the table (M, taps), the row `missing` (C,) behind the last: (M, taps * C)."""
+        self.add_input(table, TensorProto.INT32, f"{table}_rows", taps)
+        padded = self.node("Concat", owner, "padded", rows, self.constant(owner, "missing", missing[None]), axis=0)
+        gathered = self.node("Gather", owner, "gathered", padded, table, axis=0)
+        return self.reshape(owner, "rows", gathered, taps * len(missing))
+
+    def reshape(self, owner: str, what: str, rows: str, width: int, count: int = -1) -> str:
+        """Reshape to (count, width)."""
+        return self.node("Reshape", owner, what, rows, self.constant(owner, f"{what}_shape", np.array([count, width])))
+
+    def product(self, name: str, rows: str, *, steps: bool) -> str:
+        """Add a Gemm on rows that are uint8 `steps` or floating point."""
+        product = self._product(name)
+        weight, bias = product.weight.numpy(), product.bias.numpy()
+        if steps:
+            rows = self.in_float(name, "input", rows)
+        if name in self._eight_bit:
+            matrix, offset = self._rounded(name, weight, bias)
+        else:
+            matrix = self.constant(name, "weight", np.ascontiguousarray(weight.T))
+            offset = self.constant(name, "bias", bias)
+        return self.node("Gemm", name, "product", rows, matrix, offset)
+
+    def relu(self, name: str, results: str, *, steps: bool) -> str:
+        """Add the ReLU of a product, with results in uint8 `steps` or in floating point."""
+        results = self.node("Relu", name, "relu", results)
+        return self.node("QuantizeLinear", name, "steps", results, *self._step(name)) if steps else results
+
+    def in_float(self, owner: str, what: str, steps: str) -> str:
+        """Dequantize uint8 steps to STEP_VALUE times the step."""
+        return self._dequantized(owner, what, steps, *self._step(owner))
+
+    def node(self, kind: str, owner: str, what: str, *inputs: str, **attributes: int) -> str:
+        """Add one operator."""
+        name = f"{owner}.{what}"
+        self._nodes.append(helper.make_node(kind, list(inputs), [name], name=name, **attributes))
+        return name
+
+    def named(self, kind: str, outputs: Sequence[str], *inputs: str, **attributes: int) -> None:
+        """Add one operator with results of these names."""
+        self._nodes.append(helper.make_node(kind, list(inputs), list(outputs), name=f"{outputs[0]}.last", **attributes))
+
+    def constant(self, owner: str, what: str, value: NDArray[Any]) -> str:
+        """Add a unitless initializer (any shape)."""
+        name = f"{owner}.{what}"
+        self._constants[name] = value
+        return name
+
+    def save(self, path: Path, title: str) -> None:
+        """Check and write the graph."""
+        constants = [numpy_helper.from_array(value, name) for name, value in self._constants.items()]
+        graph = helper.make_graph(self._nodes, title, list(self._inputs.values()), self._outputs, constants)
+        model = helper.make_model(
+            graph, opset_imports=[helper.make_opsetid("", OPSET)], ir_version=10, producer_name="asca_export"
+        )
+        onnx.checker.check_model(model, full_check=True)
+        onnx.save(model, path)
+
+    def _rounded(self, name: str, weight: NDArray[np.float32], bias: NDArray[np.float32]) -> tuple[str, str]:
+        unit = np.maximum(np.abs(weight).max(axis=1) / WEIGHT_STEPS, _TINY).astype(np.float32)
+        whole = np.round(weight / unit[:, None]).astype(np.int8)
+        bias_unit = unit * np.float32(STEP_VALUE)
+        limit = float(np.iinfo(np.int32).max // 2)
+        whole_bias = np.clip(np.round(bias.astype(np.float64) / bias_unit), -limit, limit).astype(np.int32)
+        weight_scale = self.constant(name, "weight_unit", unit), self.constant(name, "weight_zero", 0 * whole[:, 0])
+        bias_scale = self.constant(name, "bias_unit", bias_unit), self.constant(name, "bias_zero", 0 * whole_bias)
+        matrix = self.constant(name, "weight_steps", np.ascontiguousarray(whole.T))
+        offset = self.constant(name, "bias_steps", whole_bias)
+        return (
+            self._dequantized(name, "weight", matrix, *weight_scale, axis=1),
+            self._dequantized(name, "bias", offset, *bias_scale, axis=0),
+        )
+
+    def _step(self, owner: str) -> tuple[str, str]:
+        step = self.constant(owner, "step", np.array(STEP_VALUE, np.float32))
+        return step, self.constant(owner, "zero", np.array(0, np.uint8))
+
+    def _dequantized(self, owner: str, what: str, value: str, *scale: str, **axis: int) -> str:
+        return self.node("DequantizeLinear", owner, f"{what}_values", value, *scale, **axis)
 
 
 class NeckProduct(NamedTuple):
@@ -207,3 +328,130 @@ def _joined(graph: RowGraph, maps: Sequence[str], places: Sequence[str], missing
     by_cell = graph.node("Transpose", HEAD, "by_cell", by_map)  # (H, maps)
     gathered = graph.node("Gather", HEAD, "gathered", graph.node("Concat", HEAD, "maps", *rows, axis=0), by_cell)
     return graph.reshape(HEAD, "joined", gathered, len(maps) * missing.shape[1])
+
+
+BEST_CELLS = 32  # highest-scoring cells of each scan and anchor for rounding the head
+OTHER_CELLS = 64  # other cells of each scan, so that background scores stay low
+
+
+class SparseSample(NamedTuple):
+    """Inputs of the backbone for one scan."""
+
+    features: Tensor
+    """(P, C) pillar features."""
+    rulebooks: NeckRulebooks[Tensor]
+
+    def quantize_features(self, steps: CanvasSteps) -> "SparseSample":
+        """Return the sample with features rounded to whole steps, times STEP_VALUE."""
+        whole = (self.features / steps.scale + steps.empty).round().clamp(0, STEPS)
+        return self._replace(features=whole * STEP_VALUE)
+
+
+class RowProducts(Protocol):
+    """Matrix products by name, one after the other."""
+
+    products: nn.ModuleDict
+
+    def product(self, name: str) -> nn.Linear:
+        """Return the product of this name."""
+
+    def passes(self, *sample: Any) -> Iterator[tuple[str, Tensor, Tensor]]:
+        """Yield name, input (M, n) and output (M, outputs) of each product in turn, unitless."""
+
+
+Backbone = TypeVar("Backbone", bound=RowProducts)
+
+
+class InputMoments(NamedTuple):
+    """Moments of a product's inputs: mean (n,), and mean product of the differences from it (n, n)."""
+
+    mean: Tensor
+    squares: Tensor
+
+
+@torch.no_grad()
+def scale_rows_to_steps(backbone: SparseBackbone, samples: Iterable[SparseSample]) -> None:
+    """Change the weights so that rows count steps, 0 to 255 times STEP_VALUE; the results stay the same.
+
+    Args:
+        backbone: made with the steps of the samples; changed in place.
+        samples: of the calibration scans, in steps.
+    """
+    highest = highest_outputs(backbone, samples)
+    head, first_channel = backbone.product(HEAD), 0
+    names = [[layer.name for layer in level.convolutions] for level in backbone.levels]
+    for number, level in enumerate(backbone.levels):
+        following = [*names[number][1:], None]
+        for name, next_name in zip(names[number], following, strict=True):
+            step = highest[name].clamp_min(TINY) / STEPS
+            count_steps(backbone.product(name), step)
+            readers = [next_name] if next_name else [level.upsample, *(block[0] for block in names[number + 1 :][:1])]
+            for reader in readers:
+                weight = backbone.product(reader).weight
+                weight.view(len(weight), -1, len(step)).mul_(step / STEP_VALUE)
+        channels = len(highest[level.upsample]) // level.stride**2  # the places of a channel end up in one column
+        step = highest[level.upsample].view(-1, channels).amax(dim=0).clamp_min(TINY) / STEPS
+        count_steps(backbone.product(level.upsample), step.repeat(level.stride**2))
+        head.weight[:, first_channel : first_channel + channels] *= step / STEP_VALUE
+        first_channel += channels
+
+
+def highest_outputs(backbone: RowProducts, samples: Iterable[tuple[Any, ...]]) -> dict[str, Tensor]:
+    """Return the largest value (C,) of each channel of what every product gives, by name; at least 0."""
+    highest: dict[str, Tensor] = {}
+    for sample in samples:
+        for name, _, output in backbone.passes(*sample):
+            before = highest.get(name, output.new_zeros(output.shape[1]))
+            highest[name] = torch.cat([output, before[None]]).amax(dim=0)
+    return highest
+
+
+@torch.no_grad()
+def read_moments(
+    backbone: RowProducts, samples: Sequence[tuple[Any, ...]], places: int = PLACES
+) -> dict[str, InputMoments]:
+    """Return moments of what every product reads on the calibration scans, at so many places of each at most.
+
+    A head's are those of the cells with its highest scores, and of a few others.
+    """
+    generator = torch.Generator().manual_seed(0)
+    sums: dict[str, tuple[Tensor, Tensor]] = {}
+    for sample in samples:
+        for name, read, output in backbone.passes(*sample):
+            chosen = torch.randperm(len(read), generator=generator)[:places]
+            if name == HEAD and isinstance(backbone, SparseBackbone):
+                scores = output[:, : backbone.head_channels[0]]
+                best = scores.topk(min(BEST_CELLS, len(scores)), dim=0).indices.flatten()
+                chosen = torch.cat([best, chosen[:OTHER_CELLS]])
+            rows = read[chosen].double()
+            mean, squares = rows.sum(dim=0) / max(len(rows), 1), rows.T @ rows / max(len(rows), 1)
+            before = sums.get(name, (torch.zeros_like(mean), torch.zeros_like(squares)))
+            sums[name] = before[0] + mean / len(samples), before[1] + squares / len(samples)
+    return {
+        name: InputMoments(mean.float(), (squares - torch.outer(mean, mean)).float())
+        for name, (mean, squares) in sums.items()
+    }
+
+
+@torch.no_grad()
+def round_products(backbone: RowProducts, layers: Collection[str], moments: dict[str, InputMoments]) -> None:
+    """Round the weights of `layers` to what 8-bit arithmetic will use, in place."""
+    for name in layers:
+        product = backbone.product(name)
+        rounded = round_together(product.weight, moments[name].squares)
+        product.bias.add_((product.weight - rounded) @ moments[name].mean)
+        product.weight.copy_(rounded)
+
+
+def mixed_products(exact: Backbone, rounded: Backbone, eight_bit: Iterable[str]) -> Backbone:
+    """Return a copy of `exact` with the rounded products of these names."""
+    mixed = copy.deepcopy(exact)
+    for name in eight_bit:
+        mixed.products[name] = rounded.products[name]
+    return mixed
+
+
+def count_steps(product: nn.Linear, step: Tensor) -> None:
+    """Let the outputs count unitless steps (outputs,), STEP_VALUE for each."""
+    product.weight.mul_(STEP_VALUE / step[:, None])
+    product.bias.mul_(STEP_VALUE / step)

@@ -17,8 +17,7 @@ from asca_pillars.cli.ablate import ablate, check, family_of, parse_variants
 from asca_pillars.config.pillar import PillarModel
 from asca_pillars.config.pv_rcnn import PvRcnnModel
 from asca_pillars.config.tree import load_config
-from asca_pillars.models.build import build_model
-from asca_pillars.models.checkpoint import load_checkpoint
+from asca_pillars.models.build import build_model, load_checkpoint
 from asca_pillars.training.loop import train
 from tests.helpers.bundles import PV_RCNN
 from tests.helpers.scenes import write_dataset
@@ -105,7 +104,9 @@ def test_a_base_that_a_row_would_change_otherwise_is_refused(config: str, row: s
 @pytest.mark.usefixtures("in_turn")
 def test_from_training_to_the_table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     # Its own graphs would take ten seconds; what is exported of a row is tested in tests/export.
-    monkeypatch.setattr("asca_export.export.export_bundle", lambda _, folder, __: shutil.copytree(PV_RCNN, folder))
+    monkeypatch.setattr(
+        "asca_export.export_checkpoint.export_bundle", lambda _, folder, __: shutil.copytree(PV_RCNN, folder)
+    )
     data, base = write_dataset(tmp_path / "data", 10, val_frames=8), tmp_path / "tiny.yaml"
     config = tiny_config(FEW_BALLS, epochs=1)
     base.write_text(yaml.safe_dump(to_dict(config)))

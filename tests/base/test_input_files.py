@@ -37,7 +37,7 @@ def _copied_bundle(path: Path) -> Any:
 
 def _checkpoint(path: Path) -> Any:
     pytest.importorskip("torch")
-    from asca_pillars.models.checkpoint import load_checkpoint
+    from asca_pillars.models.build import load_checkpoint
     from asca_pillars.models.openpcdet.import_checkpoint import read_foreign
 
     return load_checkpoint(path) if path.suffix == ".ckpt" else read_foreign(path)

@@ -6,7 +6,7 @@ import sys
 import tomllib
 from pathlib import Path
 
-from asca_pillars.base import installation
+from asca_pillars.base import errors, installation
 from asca_pillars.base.installation import EXTRAS, install_command, source_tree, upgrade_advice
 
 ROOT = Path(__file__).parents[2]
@@ -22,7 +22,8 @@ def test_of_a_wheel_the_advice_names_the_package(tmp_path: Path) -> None:
     """A stranger's pyproject.toml beside the packages, as some wheels install one, makes no source tree."""
     package = tmp_path / "site packages" / "asca_pillars"
     (package / "base").mkdir(parents=True)
-    shutil.copy(installation.__file__, package / "base")
+    for module in (errors, installation):
+        shutil.copy(str(module.__file__), package / "base")
     for folder in (package, package / "base"):
         (folder / "__init__.py").touch()
     (package.parent / "pyproject.toml").write_text('[project]\nname = "other"\n')

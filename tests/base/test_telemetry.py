@@ -32,7 +32,7 @@ CACHES = (".cache/numba", ".cache/matplotlib", ".config/matplotlib")
 """Below the home folder: compiled functions where the package's own folder cannot be written, and a list of fonts."""
 IMPORTERS = {
     "asca_deploy/onnx_runtime.py": "onnxruntime",
-    "asca_export/rounded_backbones.py": "onnxruntime.quantization",  # its package has imported the former
+    "asca_export/int8.py": "onnxruntime.quantization",  # its package has imported the former
 }
 
 

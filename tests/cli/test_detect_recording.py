@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from asca_deploy import find_bundle, sample_scan_path
 from asca_deploy.manifest import load_bundle
-from asca_deploy.recordings.journal import JOURNAL_FILE, Journal, ScanResult
+from asca_deploy.recordings.results import JOURNAL_FILE, Journal, ScanResult
 from asca_deploy.result_files import RUN_FILE
 from asca_pillars.base import installation
 from asca_pillars.base.errors import AscaError, ConfigError, OutputError, ScanError
@@ -281,7 +281,7 @@ def test_what_tells_of_a_recording_does_not_stay_beside_other_scans(drive: Path,
 KILLS_ITSELF = """
 import os, signal
 from asca_pillars.cli.main import main
-from asca_deploy.recordings.journal import Journal
+from asca_deploy.recordings.results import Journal
 add = Journal.add
 def add_and_die(self, result):
     add(self, result)

@@ -19,8 +19,7 @@ from asca_deploy.manifest import load_pillar_bundle
 from asca_pillars.base.errors import AscaError
 from asca_pillars.base.installation import install_command
 from asca_pillars.evaluation.kitti.average_precision import CLASS_NAMES
-from asca_pillars.models.build import build_model
-from asca_pillars.models.checkpoint import Checkpoint
+from asca_pillars.models.build import Checkpoint, build_model
 from asca_pillars.scans.scan_reader import read_scan, write_scan
 from tests.cli.eval_runs import evaluate, refusal
 from tests.helpers.gallery_cards import cards, title

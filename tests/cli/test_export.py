@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from asca_deploy import Detector
 from asca_deploy.manifest import load_pillar_bundle
 from asca_pillars.base.files import WEIGHTS_FILE
-from asca_pillars.models.checkpoint import load_checkpoint
+from asca_pillars.models.build import load_checkpoint
 from asca_pillars.models.checkpoint_file import weights_sha256
 from asca_pillars.ops.pillar.grid import PillarGrid
 from asca_pillars.scans.scan_reader import write_scan

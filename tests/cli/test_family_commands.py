@@ -14,7 +14,7 @@ from asca_pillars.base.schema import to_dict
 from asca_pillars.cli.detect import detect
 from asca_pillars.cli.inspect import inspect
 from asca_pillars.cli.prepare import prepare
-from asca_pillars.models.checkpoint import load_checkpoint
+from asca_pillars.models.build import load_checkpoint
 from asca_pillars.scans.scan_reader import write_scan
 from asca_pillars.training.loop import train
 from tests.cli.local_cluster import Here

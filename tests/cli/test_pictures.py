@@ -13,7 +13,7 @@ from asca_pillars.base.schema import to_dict
 from asca_pillars.config.pillar import PillarModel
 from asca_pillars.config.tree import Config, DataConfig
 from asca_pillars.data.training_frames import open_frames
-from asca_pillars.detection.spec import ClassSpec
+from asca_pillars.detection.anchors import ClassSpec
 from asca_pillars.pictures.training_pictures import draw_training_frame
 from asca_pillars.pictures.visualize import class_color, read_image
 from tests.data.boxes.box_scenes import write_box_dataset

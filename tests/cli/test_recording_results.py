@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from asca_deploy import Detections
-from asca_deploy.recordings.journal import Journal, ScanResult
-from asca_deploy.recordings.results import timestamp_note, track_results, tracking_order
+from asca_deploy.recordings.results import Journal, ScanResult, timestamp_note, track_results, tracking_order
 from asca_deploy.tracker import Tracker
 
 SECOND = 10**9

@@ -14,8 +14,8 @@ pytest.importorskip("rosbags", reason="needs pip install -e '.[recordings]'")
 
 from asca_deploy import sample_scan_path
 from asca_deploy.recordings import sequence_files
-from asca_deploy.recordings.journal import JOURNAL_FILE
 from asca_deploy.recordings.rerun_file import is_own_rrd
+from asca_deploy.recordings.results import JOURNAL_FILE
 from asca_pillars.base.errors import ConfigError, OutputError, ScanError
 from asca_pillars.cli.detect import detect
 from asca_pillars.pictures.colors import class_rgb

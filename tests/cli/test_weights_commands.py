@@ -8,7 +8,7 @@ import torch
 from asca_deploy.manifest import load_bundle
 from asca_deploy.shipped import find_weights
 from asca_pillars.base.locks import recover
-from asca_pillars.models.checkpoint import load_checkpoint
+from asca_pillars.models.build import load_checkpoint
 from asca_pillars.training import batch_norm
 from tests.helpers.in_process import run_here
 from tests.models.openpcdet.foreign_networks import PointPillars, write_foreign

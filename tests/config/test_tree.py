@@ -16,7 +16,7 @@ from asca_pillars.base.schema import parse, to_dict
 from asca_pillars.base.settings import shipped_configs
 from asca_pillars.config.pillar import LossConfig, PillarModel
 from asca_pillars.config.tree import Config, TrainConfig, load_config, pillar_spec
-from asca_pillars.detection.spec import ClassSpec
+from asca_pillars.detection.anchors import ClassSpec
 from asca_pillars.models.build import build_model
 from asca_pillars.models.pillar.network import PillarDetector
 from asca_pillars.models.two_stage.first_stage import with_first_stage

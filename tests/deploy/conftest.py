@@ -21,7 +21,7 @@ from asca_pillars.ops.pillar.grid import PillarGrid
 from asca_pillars.ops.pillar.neck_rulebooks import MaskRule
 from asca_pillars.ops.pillar.prepare import FEATURES, PillarLimits
 from asca_pillars.ops.pillar.spec import PillarSpec
-from asca_pillars.scans.expected_input import ExpectedInput
+from asca_pillars.scans.input_check import ExpectedInput
 
 needs_openvino = pytest.mark.skipif(
     importlib.util.find_spec("openvino") is None, reason="needs pip install -e '.[openvino]'"

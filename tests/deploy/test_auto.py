@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from asca_deploy import Detector, auto
 from asca_deploy.providers import PRECISIONS, PROVIDERS, Precision, Provider
 from asca_pillars.base.errors import BundleError, ProviderError
+from asca_pillars.detection.anchors import KITTI_CLASSES
 from asca_pillars.detection.detections import Detections
-from asca_pillars.detection.spec import KITTI_CLASSES
 from asca_pillars.ops.pillar.spec import PillarSpec
 from tests.deploy.conftest import SPEC
 

@@ -23,11 +23,9 @@ from asca_deploy.benchmark import (
     measure_scaling,
     measure_throughput,
 )
-from asca_deploy.benchmark.box_differences import box_difference
 from asca_deploy.benchmark.roofline import SIZE, gemm_rate
-from asca_deploy.benchmark.scaling import resample
-from asca_deploy.benchmark.speed_comparison import FRAMES_PER_TURN
-from asca_deploy.benchmark.throughput import FRAMES
+from asca_deploy.benchmark.speed_comparison import FRAMES_PER_TURN, box_difference
+from asca_deploy.benchmark.throughput import FRAMES, resample
 from asca_deploy.benchmark.timing import Percentiles
 from asca_deploy.manifest import load_pillar_bundle
 from asca_deploy.providers import PROVIDERS

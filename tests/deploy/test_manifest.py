@@ -1,4 +1,7 @@
-"""Manifests: what is written and read, and that a change of any field is refused, or without effect on boxes."""
+"""Manifests: what is written and read, and that a change of any field is refused, or without effect on boxes.
+
+What is read of an ONNX file without the package onnx, against that package.
+"""
 
 import json
 import math
@@ -11,15 +14,20 @@ from typing import Any
 import numpy as np
 import onnx
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from onnx import TensorProto, helper, numpy_helper
 
 from asca_deploy.bundle import MANIFEST, SCHEMA_VERSION, GraphFile, Parity, PvRcnnBundle
 from asca_deploy.manifest import (
     bundle_to_json,
     difference,
     graph_files,
+    has_external_data,
     layout_of,
     load_bundle,
     load_pillar_bundle,
+    read_metadata,
     write_bundle_manifest,
 )
 from asca_pillars.base.errors import BundleError
@@ -302,3 +310,57 @@ def test_every_field_is_refused_or_harmless(tmp_path: Path) -> None:
             same = data == json.loads(text) or path[0] in HARMLESS
             assert same, f"{path} = {parent[path[-1]]} was taken"
     assert refused > 300
+
+
+def with_tensors(*tensors: onnx.TensorProto, within: onnx.TensorProto | None = None) -> onnx.ModelProto:
+    """A model with these weights, and one more in a branch of an If."""
+    branch = [helper.make_node("Constant", [], ["out"], value=within)] if within else []
+    out = helper.make_tensor_value_info("out", TensorProto.FLOAT, [2])
+    inner = helper.make_graph(branch, "branch", [], [out])
+    choose = helper.make_node("If", ["yes"], ["out"], then_branch=inner, else_branch=inner)
+    return helper.make_model(helper.make_graph([choose], "tiny", [], [out], list(tensors)))
+
+
+def outside(tensor: onnx.TensorProto) -> onnx.TensorProto:
+    """The tensor with its data in another file."""
+    onnx.external_data_helper.set_external_data(tensor, "w.bin")
+    tensor.ClearField("raw_data")
+    tensor.data_location = TensorProto.EXTERNAL
+    return tensor
+
+
+def weight(name: str = "w") -> onnx.TensorProto:
+    return numpy_helper.from_array(np.ones(2, np.float32), name)
+
+
+@settings(max_examples=30)
+@given(st.dictionaries(st.text(max_size=9), st.text(max_size=300), max_size=5))
+def test_metadata(properties: dict[str, str]) -> None:
+    model = with_tensors(weight())
+    helper.set_model_props(model, properties)
+    assert read_metadata(model.SerializeToString()) == properties
+
+
+def test_external_data_wherever_it_is() -> None:
+    assert not has_external_data(with_tensors(weight(), weight("v"), within=weight("u")).SerializeToString())
+    assert has_external_data(with_tensors(weight(), outside(weight("v"))).SerializeToString())
+    assert has_external_data(with_tensors(weight(), within=outside(weight("u"))).SerializeToString())
+
+
+@given(st.binary(max_size=200))
+def test_other_bytes_are_refused_or_read(data: bytes) -> None:
+    for read in (read_metadata, has_external_data):
+        try:
+            read(data)
+        except ValueError:
+            continue
+
+
+@pytest.mark.parametrize("name", ["encoder.onnx", "backbone.onnx"])
+def test_a_file_that_ends_early(tiny_bundle: Path, name: str) -> None:
+    content = (tiny_bundle / name).read_bytes()
+    for end in range(1, len(content), 37):
+        try:
+            read_metadata(content[:end])
+        except ValueError:
+            continue

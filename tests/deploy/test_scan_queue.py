@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from asca_deploy import Detector
-from asca_deploy.scan_queue import ScanQueue
+from asca_deploy.stream import ScanQueue
 from asca_pillars.base.errors import ConfigError, ScanError
 from tests.deploy.conftest import make_scan
 

@@ -157,7 +157,7 @@ def test_stop_iteration_out_of_a_stage_is_an_error_and_no_end() -> None:
 
 LEFT = """
 import sys, threading
-from asca_deploy.scan_queue import ScanQueue
+from asca_deploy.stream import ScanQueue
 from asca_deploy.stream import overlap_stages
 
 def silent():

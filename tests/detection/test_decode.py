@@ -9,8 +9,8 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from asca_pillars.base.errors import ConfigError
+from asca_pillars.detection.anchors import KITTI_CLASSES, ClassSpec, make_anchors
 from asca_pillars.detection.decode import HeadMaps, PostProcess, decode, rotated_nms, vote_boxes
-from asca_pillars.detection.spec import KITTI_CLASSES, ClassSpec, make_anchors
 from asca_pillars.geometry.boxes import decode_boxes, encode_boxes
 from asca_pillars.geometry.overlap import bev_iou
 from asca_pillars.ops.pillar.grid import PillarGrid

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from asca_pillars.detection.spec import IGNORED, KITTI_CLASSES, make_anchors
+from asca_pillars.detection.anchors import IGNORED, KITTI_CLASSES, make_anchors
 from asca_pillars.detection.targets import Assigner, Targets, assign_targets
 from asca_pillars.geometry.boxes import decode_boxes, wrap_angle
 from asca_pillars.geometry.overlap import aligned_bev_iou

@@ -15,11 +15,12 @@ from asca_deploy.ort_session import OrtSession
 from asca_deploy.pillar.graphs import PILLAR_FEATURES
 from asca_export.fast_forms import CanvasSteps
 from asca_export.quantize import HEAD, STEPS, canvas_steps
-from asca_export.sparse_forms import SparseBackbone, export_sparse_backbone
-from asca_export.sparse_quantize import (
+from asca_export.sparse_forms import (
     BEST_CELLS,
     OTHER_CELLS,
+    SparseBackbone,
     SparseSample,
+    export_sparse_backbone,
     read_moments,
     round_products,
     scale_rows_to_steps,

@@ -10,7 +10,7 @@ import torch
 
 from asca_pillars.config.pillar import CpaReading, NetworkConfig, PillarModel
 from asca_pillars.config.tree import Config
-from asca_pillars.models.checkpoint import Checkpoint
+from asca_pillars.models.build import Checkpoint
 from asca_pillars.models.pillar.network import PillarDetector, build_pillar_detector
 from asca_pillars.ops.pillar.spec import PillarSpec
 from tests.helpers.scenes import SPEC, make_scene

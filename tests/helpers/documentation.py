@@ -17,8 +17,7 @@ from typer.testing import CliRunner
 from asca_deploy import sample_scan_path
 from asca_pillars.cli.main import app
 from asca_pillars.data.boxes.box_records import json_line, read_frames
-from asca_pillars.models.build import build_model
-from asca_pillars.models.checkpoint import Checkpoint
+from asca_pillars.models.build import Checkpoint, build_model
 from asca_pillars.scans.scan_reader import read_scan, write_scan
 from benchmarks.made_recordings import point_cloud2
 from tests.data.boxes.box_scenes import write_box_dataset

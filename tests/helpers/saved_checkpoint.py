@@ -6,7 +6,7 @@ from typing import Any
 import torch
 
 from asca_pillars.base.schema import to_dict
-from asca_pillars.models.checkpoint import Checkpoint
+from asca_pillars.models.build import Checkpoint
 
 
 def checkpoint_content(checkpoint: Checkpoint) -> dict[str, Any]:

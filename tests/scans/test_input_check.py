@@ -16,9 +16,14 @@ from asca_pillars.geometry.frame_change import FrameChange
 from asca_pillars.geometry.ranges import Ranges
 from asca_pillars.ops.pillar.grid import PillarGrid
 from asca_pillars.ops.pillar.prepare import PillarLimits, pillarize
-from asca_pillars.scans.expected_input import ExpectedInput
-from asca_pillars.scans.input_check import InputWarning, _percentile, check_input, ground_z_m
-from asca_pillars.scans.measure_input import measure_expected_input
+from asca_pillars.scans.input_check import (
+    ExpectedInput,
+    InputWarning,
+    _percentile,
+    check_input,
+    ground_z_m,
+    measure_expected_input,
+)
 from asca_pillars.scans.mounting import Mounting
 from asca_pillars.scans.scan_reader import read_scan
 from asca_pillars.sim.simulation import load_simulation_config, simulate_frame

@@ -15,8 +15,7 @@ from asca_pillars.base import installation
 from asca_pillars.base.errors import BundleError, TrainingError
 from asca_pillars.base.schema import to_dict
 from asca_pillars.config.pillar import PillarModel
-from asca_pillars.models.build import build_model
-from asca_pillars.models.checkpoint import Checkpoint, load_checkpoint
+from asca_pillars.models.build import Checkpoint, build_model, load_checkpoint
 from asca_pillars.models.checkpoint_file import save_weights
 from asca_pillars.training.checkpoints import AtomicCheckpointIO, BestCheckpoint, checkpoint_to_resume
 from asca_pillars.training.loop import train

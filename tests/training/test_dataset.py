@@ -14,7 +14,7 @@ from asca_pillars.config.pillar import LossConfig, NetworkConfig, PillarModel
 from asca_pillars.config.tree import Config, DataConfig
 from asca_pillars.data.frames import LabeledFrame, LabeledSplit, read_frame
 from asca_pillars.data.kitti import KittiObject, KittiSplit, in_image, objects_from_boxes, write_image_set, write_labels
-from asca_pillars.detection.spec import IGNORED
+from asca_pillars.detection.anchors import IGNORED
 from asca_pillars.detection.targets import assign_targets
 from asca_pillars.geometry.boxes import points_in_boxes
 from asca_pillars.models.pillar.network import build_pillar_detector

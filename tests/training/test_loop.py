@@ -22,12 +22,11 @@ from asca_pillars.config.pv_rcnn import PvRcnnModel
 from asca_pillars.config.tree import DataConfig, TrainConfig
 from asca_pillars.config.two_stage import RefineModel
 from asca_pillars.evaluation.recall import RecallRow, RecallTally
-from asca_pillars.models.build import build_model
-from asca_pillars.models.checkpoint import Checkpoint, load_checkpoint
+from asca_pillars.models.build import Checkpoint, build_model, load_checkpoint
 from asca_pillars.models.pillar.network import PillarDetector
 from asca_pillars.models.trainable import Trainable
 from asca_pillars.ops.pillar.prepare import PillarLimits
-from asca_pillars.scans.expected_input import ExpectedInput
+from asca_pillars.scans.input_check import ExpectedInput
 from asca_pillars.training.callbacks import SaveOnInterrupt, TrainingInterruptedError
 from asca_pillars.training.dataset import Batch, Collate, open_dataset
 from asca_pillars.training.loop import syncs_statistics, train

@@ -32,9 +32,9 @@ from asca_pillars.data.kitti.kitti_split import read_image_set
 from asca_pillars.geometry.frame_change import FrameChange
 from asca_pillars.scans.find_scans import SCAN_SUFFIXES, files_below, find_scans, visible_files
 from asca_pillars.scans.mounting import Mounting
+from asca_pillars.scans.scan_input import folder_reflectance_scale, stored_points
 from asca_pillars.scans.scan_reader import ReflectanceScale, read_scan
 from asca_pillars.scans.scan_settings import ScanSettings, sample_points
-from asca_pillars.scans.stored_scans import folder_reflectance_scale, stored_points
 
 DATASET_FILE = "dataset.yaml"
 _DEEPEST = 64

@@ -31,7 +31,8 @@ from asca_pillars.data.frames import LabeledFrame, LabeledSplit, other_spelling
 from asca_pillars.data.insertion.free_space import CELL_M, FreeSpace, load_free_space
 from asca_pillars.data.insertion.gt_database import ObjectDatabase, StoredObject, prepare_database
 from asca_pillars.data.insertion.prepared import prepared_folder
-from asca_pillars.detection.spec import IGNORED, DetectorSpec
+from asca_pillars.detection.anchors import IGNORED
+from asca_pillars.detection.spec import DetectorSpec
 from asca_pillars.geometry.arrays import Floating, Floats, Mask, Singles
 from asca_pillars.geometry.boxes import points_in_boxes, wrap_angle
 from asca_pillars.geometry.frame_change import FrameChange, transform_columns, transform_points

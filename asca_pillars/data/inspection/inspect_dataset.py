@@ -27,7 +27,7 @@ from asca_pillars.data.inspection.measurements import (
 )
 from asca_pillars.data.kitti import KittiSplit
 from asca_pillars.data.yaw_units import check_yaws
-from asca_pillars.detection.spec import ClassSpec
+from asca_pillars.detection.anchors import ClassSpec
 from asca_pillars.detection.targets import Assigner
 from asca_pillars.geometry.overlap import aligned_bev_iou
 from asca_pillars.scans.input_check import AxesWarning

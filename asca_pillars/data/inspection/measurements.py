@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from asca_pillars.config.tree import DataConfig
 from asca_pillars.data.frames import LabeledFrame, LabeledSplit, read_frame, within_ranges
-from asca_pillars.detection.spec import IGNORED
+from asca_pillars.detection.anchors import IGNORED
 from asca_pillars.detection.targets import Assigner, assign_targets
 from asca_pillars.geometry.boxes import points_in_boxes
 from asca_pillars.geometry.overlap import aligned_bev_iou

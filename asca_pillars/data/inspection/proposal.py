@@ -17,7 +17,7 @@ from asca_pillars.config.tree import Config
 from asca_pillars.data.frames import LabeledSplit
 from asca_pillars.data.inspection.findings import FEWEST_BOXES
 from asca_pillars.data.inspection.measurements import InspectedSpec
-from asca_pillars.detection.spec import ANCHOR_YAWS_RAD, ClassSpec
+from asca_pillars.detection.anchors import ANCHOR_YAWS_RAD, ClassSpec
 from asca_pillars.geometry.arrays import Floats, Singles
 from asca_pillars.geometry.boxes import points_in_boxes
 from asca_pillars.geometry.overlap import aligned_bev_iou

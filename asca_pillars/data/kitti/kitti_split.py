@@ -27,8 +27,8 @@ from asca_pillars.data.kitti.kitti_labels import KittiObject, boxes_from_objects
 from asca_pillars.geometry.frame_change import FrameChange
 from asca_pillars.scans.find_scans import visible_files
 from asca_pillars.scans.mounting import Mounting
+from asca_pillars.scans.scan_input import stored_points
 from asca_pillars.scans.scan_reader import read_scan
-from asca_pillars.scans.stored_scans import stored_points
 
 SIMULATION_FILE = "simulation.json"
 """File in the dataset's folder with the settings of `asca simulate`."""

@@ -8,8 +8,8 @@ from torch import Tensor
 from torch.nn import functional as F  # noqa: N812  (torch's own convention)
 
 from asca_pillars.config.pillar import LossConfig
+from asca_pillars.detection.anchors import ANCHOR_YAWS_RAD
 from asca_pillars.detection.decode import HeadMaps
-from asca_pillars.detection.spec import ANCHOR_YAWS_RAD
 from asca_pillars.geometry.boxes import decode_boxes
 from asca_pillars.geometry.overlap import paired_iou_3d
 

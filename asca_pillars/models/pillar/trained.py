@@ -1,10 +1,17 @@
-"""A trained pillar detector that a setting names: a checkpoint, or the weights that a bundle holds."""
+"""A trained pillar detector that a setting names: a checkpoint, or the weights that a bundle holds.
+
+Training of a pillar detector by the outputs of a trained one, its teacher (arXiv 1503.02531).
+"""
 
 import hashlib
 import json
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
 
 from asca_pillars.base.errors import BundleError, ConfigError
 from asca_pillars.base.files import WEIGHTS_FILE
@@ -12,8 +19,11 @@ from asca_pillars.base.input_files import read_text, require_content
 from asca_pillars.base.installation import find_shipped
 from asca_pillars.base.schema import parse
 from asca_pillars.config.pillar import PillarModel
+from asca_pillars.config.tree import Config
+from asca_pillars.detection.decode import PostProcess
 from asca_pillars.models.checkpoint_file import read_checkpoint, weights_sha256
-from asca_pillars.models.pillar.network import PillarDetector, build_pillar_detector
+from asca_pillars.models.pillar.loss import distillation_loss
+from asca_pillars.models.pillar.network import PillarDetector, PillarOutputs, build_pillar_detector
 from asca_pillars.ops.pillar.spec import PillarSpec
 from asca_pillars.ops.two_stage.first_stage import require_pillar_kind
 
@@ -97,3 +107,47 @@ def _find_weights(source: str, key: str) -> _Weights:
     if digest and hashlib.sha256(weights.read_bytes()).hexdigest() != digest:
         raise BundleError(f"{weights}: is damaged, or of another bundle; copy the whole bundle again")
     return _Weights(weights, parse(PillarSpec, data["spec"], str(manifest)), identity)
+
+
+class Distillation:
+    """Terms of the loss that a teacher adds. No `nn.Module`, so that a checkpoint does not hold the teacher's weights.
+
+    Args:
+        config: of the detector that learns.
+        teacher: a checkpoint of `asca train`, or a bundle that holds one: its folder, or the name of one that ships.
+
+    Raises:
+        ConfigError: `config` is of another kind, or the teacher has other pillars, anchors or active cells.
+        AscaError: as `load_trained_pillars`.
+    """
+
+    def __init__(self, config: Config, teacher: str) -> None:
+        model = config.model
+        if not isinstance(model, PillarModel):
+            raise ConfigError(f"train.teacher = {teacher}: only model.kind pillar learns from one; leave it out")
+        self._network, spec, _ = load_trained_pillars(teacher, "train.teacher")
+        self._loss, self._weight = model.loss, config.train.teacher_weight
+        ours, theirs = model.network, self._network.preparation
+        if _anchors(spec) != _anchors(model.spec):
+            raise ConfigError(
+                f"train.teacher = {teacher}: its model.spec is another; give both the same grid, limits and classes"
+            )
+        if theirs.active_cells != (ours.active_cells if ours.neck == "sparse" else None):
+            raise ConfigError(
+                f"train.teacher = {teacher}: its neck is another; give both the same model.network.neck and "
+                "model.network.active_cells"
+            )
+
+    def __call__(self, outputs: PillarOutputs, batch: Any) -> Mapping[str, Tensor]:
+        """Return the weighted terms by name, scalars, for the detector's outputs of a batch (`LabeledPillars`)."""
+        network = self._network.to(batch.pillars.features.device)
+        with torch.no_grad():
+            wanted = network(batch.pillars)
+        terms = distillation_loss(outputs.maps, wanted, self._loss)._asdict()
+        return {name: self._weight * term for name, term in terms.items()}
+
+
+def _anchors(spec: PillarSpec) -> PillarSpec:
+    """Return the spec without what neither input nor anchors depend on."""
+    classes = tuple(replace(one, positive_iou=1.0, negative_iou=0.0, score_threshold=0.0) for one in spec.classes)
+    return replace(spec, post=PostProcess(), classes=classes)

@@ -22,6 +22,7 @@ from asca_pillars.models.two_stage.layers import (
     RefineInputs,
     Refinements,
     RoiHead,
+    SetAbstraction,
     zero_of_weights,
 )
 from asca_pillars.models.two_stage.loss import RefineTargets, refine_loss
@@ -31,7 +32,6 @@ from asca_pillars.models.two_stage.preparation import (
     collate_scans,
     live_preparation,
 )
-from asca_pillars.models.two_stage.sets import SetAbstraction
 from asca_pillars.ops.two_stage.decode import Scores, refined_detections, refined_scores, reported_frames
 from asca_pillars.ops.two_stage.first_stage import SecondStageInputs
 from asca_pillars.ops.two_stage.prepare import ROI_FEATURES, RefineSettings, refine_scan

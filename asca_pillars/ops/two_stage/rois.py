@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from asca_pillars.detection.anchors import IGNORED
 from asca_pillars.detection.detections import Detections
-from asca_pillars.detection.spec import IGNORED
 from asca_pillars.geometry.boxes import decode_boxes, direction_bins, encode_boxes, points_in_boxes, wrap_angle
 from asca_pillars.geometry.overlap import iou_3d
 

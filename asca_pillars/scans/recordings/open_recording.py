@@ -14,8 +14,13 @@ from asca_pillars.scans.recordings.mcap_files import McapRecording
 from asca_pillars.scans.recordings.packet_files import PacketCapture
 from asca_pillars.scans.recordings.recording import Recording
 from asca_pillars.scans.recordings.ros_bags import RosBag
-from asca_pillars.scans.recordings.rosbag2 import METADATA_FILE, BagMetadata, SplitRecording, read_metadata
-from asca_pillars.scans.recordings.sqlite_files import SqliteRecording
+from asca_pillars.scans.recordings.rosbag2 import (
+    METADATA_FILE,
+    BagMetadata,
+    SplitRecording,
+    SqliteRecording,
+    read_metadata,
+)
 
 _READERS: dict[str, Callable[[Path, Path | None], Recording]] = {
     ".mcap": McapRecording,

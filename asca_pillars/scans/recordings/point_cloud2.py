@@ -14,8 +14,7 @@ from asca_pillars.scans.recordings.other_clouds import (
     point_cloud,
 )
 from asca_pillars.scans.recordings.packet_files import velodyne_scan
-from asca_pillars.scans.recordings.recording import Message, reason
-from asca_pillars.scans.recordings.scan_types import ScanKind
+from asca_pillars.scans.recordings.recording import Message, ScanKind, reason
 from asca_pillars.scans.records import MAX_POINTS, Field, StoredPoints, assemble_points, select_fields
 
 # sensor_msgs/PointField: datatypes 1 to 8.

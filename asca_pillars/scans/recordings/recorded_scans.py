@@ -11,12 +11,10 @@ from asca_pillars.scans.ground_height import NamedPoints
 from asca_pillars.scans.mounting import Mounting
 from asca_pillars.scans.recordings.packet_files import OusterPackets
 from asca_pillars.scans.recordings.point_cloud2 import PointCloud, read_point_cloud
-from asca_pillars.scans.recordings.recording import Message, Recording, Topic
-from asca_pillars.scans.recordings.scan_types import kind_of_scans
-from asca_pillars.scans.scan_input import scale_notes
+from asca_pillars.scans.recordings.recording import Message, Recording, Topic, kind_of_scans
+from asca_pillars.scans.scan_input import FolderScale, common_reflectance_scale, has_finite_point, scale_notes
 from asca_pillars.scans.scan_reader import ReflectanceScale, Scan, finite_scan
 from asca_pillars.scans.scan_settings import SEARCHED_SCANS, ScanSettings
-from asca_pillars.scans.stored_scans import FolderScale, common_reflectance_scale, has_finite_point
 from asca_pillars.scans.transforms import Transforms, read_static_transforms
 
 SEARCHED_MESSAGES = 300

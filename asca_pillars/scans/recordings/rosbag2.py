@@ -1,13 +1,126 @@
-"""Folders of rosbag2: a recording in several consecutive files, and its metadata.yaml."""
+"""Folders of rosbag2: a recording in several consecutive files, and its metadata.yaml.
+
+SQLite files of rosbag2, read row by row; a row that cannot be read loses only its message.
+"""
 
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import yaml
 
+from asca_pillars.base.errors import ScanError
 from asca_pillars.base.settings import MAX_CHARACTERS, parse_yaml
-from asca_pillars.scans.recordings.recording import Message, Recording, merge_topics
+from asca_pillars.scans.recordings.recording import (
+    LAST_NS,
+    UNKNOWN_TYPE,
+    Message,
+    Recording,
+    Topic,
+    merge_topics,
+    reason,
+)
+
+if TYPE_CHECKING:
+    import sqlite3  # not included in every Python
+
+
+_INSTRUCTIONS = 10_000
+"""Limit of SQLite's work: a hundred times 10,000 instructions, and a hundred for each byte of the file; files of the
+messages need less than one for each."""
+
+
+class SqliteRecording(Recording):
+    """`.db3` file of any version of rosbag2.
+
+    Args:
+        path: path of the recording in error messages.
+        file: file to read; None: `path`.
+
+    Raises:
+        ScanError: not such a file, or it cannot be read.
+    """
+
+    def __init__(self, path: Path, file: Path | None = None) -> None:
+        self.path, self._file = path, file or path
+        try:
+            with closing(self._connected()) as database:
+                self._read_topics(database)
+        except Exception as error:  # SQLite's own, and UnicodeDecodeError of its messages about damage
+            raise ScanError(
+                f"{path}: no readable rosbag2 ({reason(error)}); copy it again, or mend it "
+                "(sqlite3 broken.db3 .recover | sqlite3 mended.db3)"
+            ) from None
+
+    def messages(self, topic: str) -> Iterator[Message]:
+        """Yield the messages of a topic by time; a row without intact data is a message without data."""
+        self.damage, count = None, 0
+        declared = sum(one.messages for one in self.topics if one.name == topic)
+        numbers = self._numbers[topic]
+        if formats := self._formats[topic] - {"cdr"}:
+            raise ScanError(f"{self.path}: {topic} is encoded as {', '.join(sorted(formats))[:40]}; cdr is read")
+        # An error in one query of a connection affects its others: data are read through a separate connection.
+        with closing(self._connected()) as database, closing(self._connected()) as data:
+            try:
+                rows = database.execute(
+                    f"SELECT rowid, timestamp FROM messages WHERE topic_id IN ({', '.join('?' * len(numbers))}) "
+                    "ORDER BY timestamp",
+                    numbers,
+                )
+                for row, recorded_ns in rows:
+                    if count == declared:  # damaged pages that refer to each other give endless rows
+                        raise ValueError("its index of times is damaged")
+                    is_usable = isinstance(recorded_ns, int) and 0 <= recorded_ns <= LAST_NS
+                    yield Message(recorded_ns if is_usable else None, self._data(data, row), "cdr")
+                    count += 1
+            except Exception as error:
+                self.damage = f"{self.path}: ends early, after {count} messages of {topic} ({reason(error)})"
+
+    def _connected(self) -> "sqlite3.Connection":
+        import sqlite3
+
+        # A detector's stream may read in another thread than the opening one, but never in two at once.
+        connection = sqlite3.connect(f"{self._file.resolve().as_uri()}?immutable=1", uri=True, check_same_thread=False)
+        connection.text_factory = _text
+        left = iter(range(100 + self._file.stat().st_size // 100))
+        connection.set_progress_handler(lambda: next(left, None) is None, _INSTRUCTIONS)
+        return connection
+
+    def _read_topics(self, database: "sqlite3.Connection") -> None:
+        tables = database.execute(
+            "SELECT count(*) FROM sqlite_master WHERE type = 'table' AND name IN ('messages', 'topics')"
+        )
+        if tables.fetchone()[0] != 2:
+            raise ValueError("it has no tables messages and topics")
+        counts = dict(database.execute("SELECT topic_id, count(*) FROM messages GROUP BY topic_id").fetchall())
+        topics: list[Topic] = []
+        self._numbers: dict[str, list[Any]] = {}
+        self._formats: dict[str, set[str]] = {}
+        for number, name, kind, encoding in database.execute("SELECT id, name, type, serialization_format FROM topics"):
+            if not isinstance(name, str) or not name:
+                continue
+            kind = kind if isinstance(kind, str) and kind else UNKNOWN_TYPE
+            topics.append(Topic(name, kind, counts.pop(number, 0)))
+            self._numbers.setdefault(name, []).append(number)
+            self._formats.setdefault(name, set()).add(encoding if isinstance(encoding, str) and encoding else "cdr")
+        self.topics = merge_topics(topics)
+        if lost := sum(counts.values()):
+            self.damage = f"{self.path}: {lost} messages belong to no topic with a name"
+
+    @staticmethod
+    def _data(database: "sqlite3.Connection", row: int) -> bytes:
+        try:
+            found = database.execute("SELECT data FROM messages WHERE rowid = ?", (row,)).fetchone()
+        except Exception:  # damaged pages
+            return b""
+        return found[0] if found is not None and isinstance(found[0], bytes) else b""
+
+
+def _text(content: bytes) -> str:
+    return content.decode("utf-8", errors="replace")
+
 
 METADATA_FILE = "metadata.yaml"
 _KEY = "rosbag2_bagfile_information"

@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from asca_pillars.data.kitti import Calibration
-from asca_pillars.sim.bodies import cycles, people, shape_noise, styles, vehicles
+from asca_pillars.sim.bodies import cycles, people, primitives, vehicles
 from asca_pillars.sim.bodies.primitives import BACKGROUND, Primitives
 from asca_pillars.sim.casting.raycast import Bodies
 from asca_pillars.sim.scene_config import SceneConfig
@@ -128,7 +128,7 @@ def body_of(target: Target, config: SceneConfig, rng: np.random.Generator) -> Pr
     if name in ("Car", "Van"):
         # Annotators fit boxes to many scans of a car: their faces are a few centimetres off the body, on either side.
         slack = rng.uniform((-0.08, -0.04, -0.05), (0.12, 0.10, 0.06))
-        profile = styles.draw_style(rng, length, height, van=name == "Van")
+        profile = vehicles.draw_style(rng, length, height, van=name == "Van")
         dark = config.dark_paint_share if name == "Car" else 0.1
         body = vehicles.car_body(rng, length - slack[0], width - slack[1], height - slack[2], profile, dark, footprint)
     elif name == "Truck":
@@ -148,11 +148,11 @@ def body_of(target: Target, config: SceneConfig, rng: np.random.Generator) -> Pr
         body = cycles.cyclist_body(rng, height - 0.08, width, length - 0.04, footprint)
     most = float(rng.uniform(*config.warp_m))
     if name in ("Pedestrian", "Person_sitting", "Cyclist"):
-        body = shape_noise.scaled(body, rng.uniform((0.94, 0.94, 0.98), (1.06, 1.06, 1.02)))
+        body = primitives.scaled(body, rng.uniform((0.94, 0.94, 0.98), (1.06, 1.06, 1.02)))
         most *= 0.7  # for a person's size, waves as high as a car's would separate limbs
-    body = shape_noise.warped(rng, body, most)
+    body = primitives.warped(rng, body, most)
     if rng.random() < config.dark_patch_share:
-        body = shape_noise.darkened(rng, body)
+        body = primitives.darkened(rng, body)
     dx, dy = rng.normal(0.0, config.box_offset_sigma_m, 2)
     if name in ("Pedestrian", "Person_sitting"):
         # Annotators center a person's box on the visible side, towards the sensor.

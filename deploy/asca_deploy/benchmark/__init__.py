@@ -4,9 +4,8 @@ from asca_deploy.benchmark.bench_report import BenchmarkReport, benchmark
 from asca_deploy.benchmark.cold import ColdStart, cold_start
 from asca_deploy.benchmark.matrix import MatrixRow, measure_matrix
 from asca_deploy.benchmark.roofline import Roofline, measure_roofline
-from asca_deploy.benchmark.scaling import ScalingRow, measure_scaling
 from asca_deploy.benchmark.speed_comparison import Comparison, Contestant, alternate, compare
-from asca_deploy.benchmark.throughput import Throughput, measure_throughput
+from asca_deploy.benchmark.throughput import ScalingRow, Throughput, measure_scaling, measure_throughput
 
 __all__ = [
     "BenchmarkReport",

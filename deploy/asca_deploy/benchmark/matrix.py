@@ -8,8 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from asca_deploy.benchmark.box_differences import BoxDifference, box_difference
-from asca_deploy.benchmark.speed_comparison import Contestant, compare
+from asca_deploy.benchmark.speed_comparison import BoxDifference, Contestant, box_difference, compare
 from asca_deploy.benchmark.timing import Track, silently
 from asca_deploy.detector import Detector
 from asca_deploy.providers import PRECISIONS, PROVIDERS, Precision, Provider

@@ -1,6 +1,13 @@
-"""Inputs and outputs of the graphs of a pillar bundle, by name, and how they are opened."""
+"""Inputs and outputs of the graphs of a pillar bundle, by name, and how they are opened.
+
+Interface of the pillar family's backbone graph, with a dense neck and with a sparse one.
+"""
 
 from pathlib import Path
+from typing import Any, NamedTuple, Protocol, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
 
 from asca_deploy import providers
 from asca_deploy.bundle import ENCODER, NECK, PillarBundle
@@ -9,6 +16,7 @@ from asca_pillars.base.errors import ProviderError
 from asca_pillars.detection.decode import HeadMaps
 from asca_pillars.ops.pillar.neck_rulebooks import LEVELS, SAME
 from asca_pillars.ops.pillar.prepare import FEATURES
+from asca_pillars.ops.two_stage.first_stage import FirstStageOutputs
 
 PILLAR_FEATURES = "pillar_features"
 """Output of encoder.onnx; the backbone of a sparse neck takes it under the same name."""
@@ -78,3 +86,32 @@ def check_neck(bundle: PillarBundle, provider: str) -> None:
             f"provider {provider} cannot run the sparse neck of {bundle.name}: {_NO_SPARSE_NECK[provider]}; "
             "choose provider cpu, or a dense neck, as `asca export default --dense-neck` makes it of a pillar detector"
         )
+
+
+Maps: TypeAlias = HeadMaps[NDArray[np.float32]]
+
+
+class HeadOutputs(NamedTuple):
+    """Outputs of the head for one scan, as `decode` takes them."""
+
+    maps: Maps
+    """Head maps, or rows of the head's active cells."""
+    cells: NDArray[np.int32] | None
+    """(M,) flat index of the head cell of each row; None of maps."""
+
+
+class PillarBackbone(Protocol):
+    """Neck and head. What belongs to one scan travels from `place` to `run`, so that several threads may call them."""
+
+    @property
+    def stage(self) -> str:
+        """Name of the stage `place` in reports."""
+
+    def place(self, pillar_features: NDArray[Any], cells: NDArray[np.int64]) -> Any:
+        """Place pillar features (P, C), in the bundle's type, at flat cell indices (P,): the graph's input."""
+
+    def run(self, placed: Any) -> HeadOutputs:
+        """Run the graph; each placed scan may be given once."""
+
+    def infer_with_neck(self, placed: Any) -> FirstStageOutputs:
+        """Run the graph as `run` does, and return the head's input too; for graphs that a second stage follows."""

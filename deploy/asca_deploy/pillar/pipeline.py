@@ -11,8 +11,16 @@ from numpy.typing import NDArray
 from asca_deploy import providers
 from asca_deploy.bundle import BACKBONE, NECK, CanvasFormat, PillarBundle
 from asca_deploy.graph import Session, check_interface
-from asca_deploy.pillar.backbone import HeadOutputs, Maps, PillarBackbone
-from asca_deploy.pillar.graphs import PILLAR_FEATURES, backbone_interface, check_neck, open_encoder, output_channels
+from asca_deploy.pillar.graphs import (
+    PILLAR_FEATURES,
+    HeadOutputs,
+    Maps,
+    PillarBackbone,
+    backbone_interface,
+    check_neck,
+    open_encoder,
+    output_channels,
+)
 from asca_deploy.pipeline import Pipeline, StageTimes
 from asca_pillars.base.kernels import load_kernels
 from asca_pillars.detection.decode import HeadMaps, decode

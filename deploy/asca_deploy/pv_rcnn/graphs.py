@@ -1,10 +1,13 @@
-"""Inputs and outputs of the graphs of a pv_rcnn bundle, by name."""
+"""Inputs and outputs of the graphs of a pv_rcnn bundle, by name.
+
+Bird's-eye-view map of the voxels of the last level.
+"""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
 from asca_deploy.bundle import PvRcnnBundle, PvRcnnSection
 from asca_deploy.graph import Interface, Tensor
@@ -12,6 +15,7 @@ from asca_pillars.detection.decode import HeadMaps
 from asca_pillars.ops.points.neighbors import ball_query
 from asca_pillars.ops.pv_rcnn.prepare import LEVEL_SOURCES, SourceBalls, VoxelScan, VoxelSetSettings
 from asca_pillars.ops.pv_rcnn.rulebooks import SUBMANIFOLD, VoxelLevel
+from asca_pillars.ops.sparse.rulebooks import Shape
 
 VOXEL_VALUES = 4
 """Values of a voxel that enter voxels.onnx: x, y, z, reflectance."""
@@ -180,3 +184,34 @@ def balls_around(
             else list(scan.ball_indices[number])
         )
     return balls
+
+
+class VoxelCanvas:
+    """The map (1, H, W, C), channels last, C being the voxels of a column one above the other (PV-RCNN, section 3.1).
+
+    Allocated once and kept from scan to scan; only the cells of the scan before are cleared.
+
+    Args:
+        shape: of the last level, cells along z, y, x.
+        channels: C.
+        dtype: of what is scattered: float32, or uint8 for whole steps.
+    """
+
+    def __init__(self, shape: Shape, channels: int, dtype: DTypeLike = np.float32) -> None:
+        height, rows, columns = shape
+        self.image: NDArray[Any] = np.zeros((1, rows, columns, channels), dtype)
+        self.rows = self.image.reshape(-1, channels)
+        """(H * W, C), the same memory."""
+        self._voxels = self.image.reshape(-1, channels // height)
+        self._occupied = np.empty(0, np.int64)
+
+    def scatter(self, features: NDArray[Any], cells: NDArray[np.int64]) -> None:
+        """Write the features (N, C / nz) of the active voxels; every other one is zero.
+
+        Args:
+            features: of the voxels.
+            cells: (N,) their flat indices, z running fastest, each once.
+        """
+        self._voxels[self._occupied] = 0
+        self._voxels[cells] = features
+        self._occupied = cells

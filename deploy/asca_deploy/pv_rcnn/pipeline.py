@@ -13,9 +13,9 @@ from asca_deploy.bundle import BACKBONE, DEFORM, KEYPOINTS, REFINE, VOXELS, PvRc
 from asca_deploy.graph import Interface, Session, check_interface
 from asca_deploy.pillar.pipeline import channels_first, run_graph, take_or_create
 from asca_deploy.pipeline import Pipeline, StageTimes
-from asca_deploy.pv_rcnn.canvas import VoxelCanvas
 from asca_deploy.pv_rcnn.graphs import (
     OUT,
+    VoxelCanvas,
     backbone_interface,
     balls_around,
     deform_inputs,

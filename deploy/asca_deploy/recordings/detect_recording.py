@@ -17,12 +17,15 @@ from numpy.typing import NDArray
 from asca_deploy.detect_scans import DetectedScan, repairs
 from asca_deploy.detector import Detector
 from asca_deploy.open_model import RuntimeOptions, open_detector, scans_need_around, track_thresholds
-from asca_deploy.recordings.journal import JOURNAL_FILE, Journal, ScanResult, is_journal
 from asca_deploy.recordings.results import (
+    JOURNAL_FILE,
     FrameResult,
+    Journal,
     JsonLines,
     KittiTracks,
     ResultFile,
+    ScanResult,
+    is_journal,
     open_text,
     timestamp_note,
     track_results,
@@ -41,11 +44,11 @@ from asca_pillars.detection.spec import ScoreThresholds
 from asca_pillars.pictures.video import VideoView
 from asca_pillars.scans.mounting import Mounting
 from asca_pillars.scans.recordings.images import NearestImages
-from asca_pillars.scans.recordings.odometry import Poses, read_poses
 from asca_pillars.scans.recordings.open_recording import open_recording, recording_files
 from asca_pillars.scans.recordings.recorded_scans import RecordedScan, RecordedScans
 from asca_pillars.scans.recordings.recording import topics_text
 from asca_pillars.scans.scan_settings import ScanSettings
+from asca_pillars.scans.transforms import Poses, read_poses
 
 _PLAIN = RuntimeOptions()
 _AS_TRAINED = ScanSettings()

@@ -1,22 +1,186 @@
-"""The files that `asca detect` makes of a recording: JSON lines, KITTI's tracking text, Foxglove, rerun."""
+"""The files that `asca detect` makes of a recording: JSON lines, KITTI's tracking text, Foxglove, rerun.
+
+Journal of a recording's detections: lines that remain of a killed run and that the next one resumes from.
+
+The journal holds the detections of every scan, to the last bit; track identities and all output files are made from
+it at the end, atomically. So they are the same whether the run was killed or not. Its first line says what the results
+depend on; if that differs, the journal is begun anew. Every line has a digest (`base.files`): a truncated or damaged
+one is dropped, and its scan processed again.
+"""
 
 import json
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
-from typing import IO, NamedTuple, Protocol
+from types import TracebackType
+from typing import IO, Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from asca_deploy.recordings.journal import Journal
-from asca_deploy.tracker import MAX_SCAN_GAP_S, Tracker
-from asca_deploy.tracks import Tracks
+from asca_deploy.result_files import COMMAND
+from asca_deploy.tracker import MAX_SCAN_GAP_S, Tracker, Tracks
+from asca_pillars.base.errors import OutputError
+from asca_pillars.base.files import add_checksum, atomic_path, verify_checksum
+from asca_pillars.base.locks import only_writer
+from asca_pillars.base.own_files import require_no_link
 from asca_pillars.data.boxes.detector_scope import DetectorScope
 from asca_pillars.data.kitti import DEFAULT_IMAGE_SIZE_WH, Calibration, labels_text, objects_from_boxes
 from asca_pillars.detection.detections import Detections
 from asca_pillars.geometry.frame_change import FrameChange
+
+JOURNAL_FILE = "detections.partial.jsonl"
+_LONGEST_HEAD_BYTES = 1 << 24
+_KEY = "journal of asca detect"  # key of the first line, whose text is the key of the others
+
+
+class ScanResult(NamedTuple):
+    """Result of one message: its number, time and frame, and its detections or why it was skipped."""
+
+    number: int
+    time_ns: int
+    frame_id: str
+    detections: Detections | None
+    error_text: str | None = None
+    dropped_points: int = 0
+
+
+def is_journal(path: Path) -> bool:
+    """Return whether a file begins as a journal does."""
+    with path.open("rb") as file:
+        return verify_checksum(file.readline(_LONGEST_HEAD_BYTES), _KEY) is not None
+
+
+class Journal:
+    """The journal of a run in `folder`, which no other run writes into while it is open.
+
+    Attributes:
+        differs: what another run that left one here had otherwise, the first key; None if there was none.
+
+    Raises:
+        OutputError: when the block is entered, if another process works in `folder`, or a file of the journal's name
+            is not a journal.
+    """
+
+    def __init__(self, folder: Path, about: dict[str, Any], class_names: tuple[str, ...]) -> None:
+        self.path, self._class_names = folder / JOURNAL_FILE, class_names
+        self._about = json.dumps(about)
+        self._stack = ExitStack()
+        self._file: IO[bytes]
+        self._starts: dict[int, int] = {}  # number of a message -> where its line starts
+        self._end = 0
+        self.differs: str | None = None
+
+    @property
+    def done(self) -> int:
+        """Number of messages in the journal."""
+        return len(self._starts)
+
+    def __contains__(self, number: int) -> bool:
+        return number in self._starts
+
+    def __enter__(self) -> "Journal":
+        with ExitStack() as stack:
+            stack.enter_context(only_writer(self.path.parent, COMMAND))
+            require_no_link(self.path)
+            if self.path.exists() and not is_journal(self.path):
+                raise OutputError(
+                    f"{self.path}: is not a journal of `{COMMAND}`, or damaged in its first line; delete it or move it "
+                    "away, or choose another --out"
+                )
+            kept = self._whole_lines()
+            if kept is not None:  # written anew rather than cut
+                with atomic_path(self.path) as temporary, temporary.open("wb") as new:
+                    new.write(add_checksum(self._about, _KEY).encode())
+                    new.writelines(self._lines(kept))
+                self._whole_lines()
+            self._file = stack.enter_context(self.path.open("ab"))
+            self._stack = stack.pop_all()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._stack.close()
+
+    def add(self, result: ScanResult) -> None:
+        """Append a scan's result; it outlives a kill from here on."""
+        found = result.detections
+        line: dict[str, Any] = {"number": result.number, "time_ns": result.time_ns, "frame_id": result.frame_id}
+        if found is None:
+            line["trouble"] = result.error_text
+        else:
+            line |= {"boxes": found.boxes.tolist(), "scores": found.scores.tolist(), "labels": found.labels.tolist()}
+            line["dropped_points"] = result.dropped_points
+        content = add_checksum(json.dumps(line), self._about).encode()
+        try:
+            self._file.write(content)
+            self._file.flush()
+        except OSError as error:  # a full disk names no file
+            raise OSError(error.errno, error.strerror, str(self.path)) from error
+        self._starts[result.number] = self._end
+        self._end += len(content)
+
+    def results(self) -> Iterator[ScanResult]:
+        """Yield all results in the order of the messages."""
+        for line in self._lines([self._starts[number] for number in sorted(self._starts)]):
+            text = verify_checksum(line, self._about)
+            if text is None:
+                raise OutputError(f"{self.path}: was changed while it was written; give the same command again")
+            yield self._result(json.loads(text))
+
+    def remove(self) -> None:
+        """Delete the journal after its results have been written."""
+        self.path.unlink()
+
+    def _whole_lines(self) -> list[int] | None:
+        """Find the lines that are whole and of this run.
+
+        Returns:
+            None if the journal holds nothing else; where they start if it must be written anew.
+        """
+        self._starts, self._end = {}, 0
+        if not self.path.exists():
+            return []
+        with self.path.open("rb") as file:
+            first = file.readline()
+            before = verify_checksum(first, _KEY)
+            if before != self._about:
+                self.differs = _first_difference(json.loads(before or "{}"), json.loads(self._about))
+                return []
+            self._end, whole = len(first), True
+            for line in file:
+                text = verify_checksum(line, self._about)
+                if text is None:
+                    whole = False
+                else:
+                    self._starts[json.loads(text)["number"]] = self._end
+                self._end += len(line)
+        return None if whole else sorted(self._starts.values())
+
+    def _lines(self, starts: list[int]) -> Iterator[bytes]:
+        if not starts:
+            return
+        with self.path.open("rb") as file:
+            for start in starts:
+                file.seek(start)
+                yield file.readline()
+
+    def _result(self, line: dict[str, Any]) -> ScanResult:
+        place = line["number"], line["time_ns"], line["frame_id"]
+        if "trouble" in line:
+            return ScanResult(*place, None, line["trouble"])
+        boxes = np.array(line["boxes"], np.float32).reshape(-1, 7)
+        scores, labels = np.array(line["scores"], np.float32), np.array(line["labels"], np.int64)
+        return ScanResult(
+            *place, Detections(boxes, scores, labels, self._class_names), dropped_points=line["dropped_points"]
+        )
+
+
+def _first_difference(before: dict[str, Any], about: dict[str, Any]) -> str:
+    return next((key for key in about if before.get(key) != about[key]), "its content")
+
 
 _MIRROR = FrameChange(np.diag([1.0, -1.0, 1.0]), np.zeros(3))
 

@@ -13,17 +13,16 @@ from asca_deploy.detector import Detector
 from asca_deploy.ros2.health import Health
 from asca_deploy.ros2.messages import Stamp, stamp_of
 from asca_deploy.scan_detections import ScanDetections
-from asca_deploy.scan_queue import ScanQueue
 from asca_deploy.shipped import sample_scan_path
-from asca_deploy.tracker import Tracker
-from asca_deploy.tracks import Tracks
+from asca_deploy.stream import ScanQueue
+from asca_deploy.tracker import Tracker, Tracks
 from asca_pillars.base.errors import AscaError, ConfigError, ScanError
 from asca_pillars.scans.ground_height import NamedPoints, estimate_named_height
 from asca_pillars.scans.mounting import Mounting
 from asca_pillars.scans.recordings.point_cloud2 import point_cloud_points
+from asca_pillars.scans.scan_input import common_reflectance_scale, has_finite_point
 from asca_pillars.scans.scan_reader import finite_scan, read_scan
 from asca_pillars.scans.scan_settings import SAMPLE_SCANS, SEARCHED_SCANS, ScanSettings
-from asca_pillars.scans.stored_scans import common_reflectance_scale, has_finite_point
 
 _SCALE_SCANS = 16  # with points, that decide the reflectance's scale, as in a recording
 _WARM_UP_SCANS = 3

@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from math import atan2, cos, hypot, sin
 from typing import Any, NamedTuple, TypeAlias
 
-from asca_deploy.tracks import Tracks
+from asca_deploy.tracker import Tracks
 from asca_pillars.detection.detections import Detection, Detections
 from asca_pillars.pictures.colors import class_shares
 

@@ -25,8 +25,7 @@ from asca_deploy.ros2.messages import (
     message_type,
 )
 from asca_deploy.scan_detections import ScanDetections
-from asca_deploy.tracker import Tracker
-from asca_deploy.tracks import Tracks
+from asca_deploy.tracker import Tracker, Tracks
 from asca_pillars.base.errors import ConfigError, ProviderError
 from asca_pillars.base.installation import install_command
 from asca_pillars.scans.mounting import Mounting

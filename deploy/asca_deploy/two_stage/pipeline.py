@@ -20,7 +20,7 @@ from asca_pillars.detection.detections import Detections
 from asca_pillars.ops.pillar.prepare import PillarCounts
 from asca_pillars.ops.pillar.spec import PillarSpec
 from asca_pillars.ops.points import neighbors, sampling
-from asca_pillars.ops.points.ball_layouts import BallGroup, GroupedBalls, gather_balls, group_balls, group_widths
+from asca_pillars.ops.points.neighbors import BallGroup, GroupedBalls, gather_balls, group_balls, group_widths
 from asca_pillars.ops.two_stage.decode import reported_detections
 from asca_pillars.ops.two_stage.first_stage import FirstStageOutputs, second_stage_inputs
 from asca_pillars.ops.two_stage.prepare import ROI_FEATURES, RefineScan, refine_scan

@@ -20,7 +20,7 @@ from asca_pillars.base.files import atomic_directory
 from asca_pillars.base.system import default_threads
 from asca_pillars.config.pillar import PillarModel
 from asca_pillars.config.tree import ModelConfig
-from asca_pillars.models.checkpoint import Checkpoint
+from asca_pillars.models.build import Checkpoint
 from asca_pillars.models.pillar.network import PillarDetector
 
 
@@ -30,7 +30,7 @@ def export_pillar_bundle(
     scans: Sequence[NDArray[np.float32]],
     options: ExportOptions = DEFAULTS,
 ) -> PillarBundle:
-    """Export kind pillar, see `asca_export.export.export_bundle`: encoder.onnx and backbone.onnx."""
+    """Export kind pillar, see `asca_export.export_checkpoint.export_bundle`: encoder.onnx and backbone.onnx."""
     model, detector, calibration = checkpoint.config.model, checkpoint.detector, options.calibration
     assert isinstance(model, PillarModel) and isinstance(detector, PillarDetector), "it is of kind pillar"
     require_parity_scans(scans)

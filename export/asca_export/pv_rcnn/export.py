@@ -18,7 +18,7 @@ from asca_export.pv_rcnn.parity import check_pv_rcnn_parity
 from asca_pillars.base.files import atomic_directory
 from asca_pillars.base.system import default_threads
 from asca_pillars.config.pv_rcnn import PvRcnnModel
-from asca_pillars.models.checkpoint import Checkpoint
+from asca_pillars.models.build import Checkpoint
 from asca_pillars.models.pv_rcnn.network import PvRcnnDetector
 
 
@@ -28,7 +28,7 @@ def export_pv_rcnn_bundle(
     scans: Sequence[NDArray[np.float32]],
     options: ExportOptions = DEFAULTS,
 ) -> PvRcnnBundle:
-    """Export kind pv_rcnn, see `asca_export.export.export_bundle`: four graphs.
+    """Export kind pv_rcnn, see `asca_export.export_checkpoint.export_bundle`: four graphs.
 
     With `options.calibration` the first stage is put in 8 bits; what follows the proposals stays in float32.
     """

@@ -14,8 +14,7 @@ from asca_export.fast_forms import FastBackbone
 from asca_export.graphs import export_backbone, export_row_graph, graph_path
 from asca_export.pv_rcnn.voxel_forms import VoxelProducts, export_voxels
 from asca_export.two_stage.graphs import fold_norms
-from asca_pillars.models.pv_rcnn.keypoints import Surroundings
-from asca_pillars.models.pv_rcnn.layers import PvRcnn
+from asca_pillars.models.pv_rcnn.layers import PvRcnn, Surroundings
 from asca_pillars.models.two_stage.layers import RoiHead, SourceRows
 from asca_pillars.ops.points.neighbors import PointScale
 from asca_pillars.ops.pv_rcnn.prepare import SourceBalls, VoxelSetSettings

@@ -17,15 +17,13 @@ from numpy.typing import NDArray
 
 from asca_deploy.bundle import BACKBONE, KEYPOINTS, VOXELS, PvRcnnBundle
 from asca_deploy.detector import Detector
-from asca_deploy.pv_rcnn.canvas import VoxelCanvas
-from asca_deploy.pv_rcnn.graphs import OUT, map_channels, voxel_inputs, voxels_interface
+from asca_deploy.pv_rcnn.graphs import OUT, VoxelCanvas, map_channels, voxel_inputs, voxels_interface
 from asca_deploy.pv_rcnn.pipeline import PvRcnnPipeline
 from asca_export.fast_forms import CanvasSteps, FastBackbone
 from asca_export.graphs import graph_path
-from asca_export.int8 import Points, calibration_scans, logit_error, sweep, write_quantized
+from asca_export.int8 import Points, RoundedMaps, calibration_scans, logit_error, sweep, write_quantized
 from asca_export.pv_rcnn.voxel_forms import RoundedVoxels, VoxelSample
 from asca_export.quantize import STEPS
-from asca_export.rounded_backbones import RoundedMaps
 from asca_export.two_stage.first_stage import scale_bev
 from asca_pillars.base.errors import ExportError
 from asca_pillars.config.pv_rcnn import PvRcnnModel

@@ -7,8 +7,7 @@ import torch
 from numpy.typing import NDArray
 
 from asca_deploy.bundle import Parity
-from asca_deploy.pv_rcnn.canvas import VoxelCanvas
-from asca_deploy.pv_rcnn.graphs import OUT, balls_around
+from asca_deploy.pv_rcnn.graphs import OUT, VoxelCanvas, balls_around
 from asca_deploy.pv_rcnn.pipeline import PvRcnnPipeline
 from asca_export.parity import require_close, require_compared, require_same_refined
 from asca_pillars.detection.decode import HeadMaps

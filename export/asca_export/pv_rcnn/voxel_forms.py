@@ -16,9 +16,16 @@ from torch import Tensor, nn
 from asca_deploy.pv_rcnn.graphs import OUT, VOXEL_VALUES
 from asca_export.fast_forms import STEP_VALUE
 from asca_export.quantize import STEPS, TINY
-from asca_export.row_graphs import RowGraph
-from asca_export.sparse_forms import linear, scale_and_shift
-from asca_export.sparse_quantize import count_steps, highest_outputs, mixed_products, read_moments, round_products
+from asca_export.sparse_forms import (
+    RowGraph,
+    count_steps,
+    highest_outputs,
+    linear,
+    mixed_products,
+    read_moments,
+    round_products,
+    scale_and_shift,
+)
 from asca_pillars.models.pv_rcnn.layers import SparseConvBlock, VoxelBackbone
 from asca_pillars.ops.pv_rcnn.prepare import LEVEL_SOURCES
 

@@ -33,7 +33,7 @@ from asca_pillars.base.errors import ExportError
 from asca_pillars.base.files import atomic_directory
 from asca_pillars.base.system import default_threads
 from asca_pillars.config.tree import pillar_spec
-from asca_pillars.models.checkpoint import Checkpoint, load_checkpoint
+from asca_pillars.models.build import Checkpoint, load_checkpoint
 from asca_pillars.models.two_stage.first_stage import with_first_stage
 from asca_pillars.models.two_stage.network import RefineDetector
 from asca_pillars.ops.two_stage.first_stage import FirstStage
@@ -45,7 +45,7 @@ def export_refine_bundle(
     scans: Sequence[NDArray[np.float32]],
     options: ExportOptions = DEFAULTS,
 ) -> PillarBundle:
-    """Export kind pillar_refine, see `asca_export.export.export_bundle`: the first stage's graphs and refine.onnx.
+    """Export kind pillar_refine, see `export_checkpoint.export_bundle`: the first stage's graphs and refine.onnx.
 
     The first stage is the one that the checkpoint was trained on. With `options.calibration` it then gives way to its
     8-bit form: of a bundle the one named like it with `_int8`, of a checkpoint one made on those scans. The second

@@ -13,9 +13,8 @@ from asca_deploy.bundle import RefineSection
 from asca_deploy.two_stage.pipeline import grid_names, refine_interface
 from asca_export.graphs import export_row_graph
 from asca_export.sparse_forms import scale_and_shift
-from asca_pillars.models.two_stage.layers import PillarRefiner, SourceRows
-from asca_pillars.models.two_stage.sets import SetAbstraction, VectorPool
-from asca_pillars.ops.points.ball_layouts import BallGroup, GroupedBalls
+from asca_pillars.models.two_stage.layers import PillarRefiner, SetAbstraction, SourceRows, VectorPool
+from asca_pillars.ops.points.neighbors import BallGroup, GroupedBalls
 from asca_pillars.ops.two_stage.prepare import RefineSettings
 
 

@@ -20,7 +20,7 @@ from asca_pillars.data.inspection.findings import Finding, findings
 from asca_pillars.data.inspection.inspect_dataset import inspect_dataset
 from asca_pillars.data.open_split import open_split
 from asca_pillars.data.training_frames import open_frames
-from asca_pillars.detection.spec import ClassSpec
+from asca_pillars.detection.anchors import ClassSpec
 from asca_pillars.scans.mounting import Mounting
 from asca_pillars.scans.scan_reader import read_scan, write_scan
 from tests.data.boxes.box_scenes import write_box_dataset

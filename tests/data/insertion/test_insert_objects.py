@@ -33,7 +33,7 @@ from asca_pillars.data.insertion.insert_objects import (
     rays_entering,
 )
 from asca_pillars.data.kitti import KittiSplit, objects_3d, read_labels, write_image_set, write_labels
-from asca_pillars.detection.spec import IGNORED
+from asca_pillars.detection.anchors import IGNORED
 from asca_pillars.geometry.boxes import points_in_boxes, wrap_angle
 from asca_pillars.ops.pillar.grid import PillarGrid
 from asca_pillars.scans.scan_reader import write_scan

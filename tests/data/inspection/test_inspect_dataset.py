@@ -20,7 +20,7 @@ from asca_pillars.config.tree import Config, pillar_spec
 from asca_pillars.data.frames import LabeledFrame
 from asca_pillars.data.inspection.measurements import MatchOutcome, match, measure_frame, measure_scan
 from asca_pillars.data.kitti import KittiSplit, read_labels
-from asca_pillars.detection.spec import IGNORED
+from asca_pillars.detection.anchors import IGNORED
 from asca_pillars.detection.targets import Assigner, assign_targets
 from asca_pillars.geometry.boxes import points_in_boxes
 from asca_pillars.geometry.overlap import aligned_bev_iou

@@ -17,8 +17,7 @@ from asca_deploy.ros2.health import Systemd
 from asca_deploy.ros2.live import LiveDetection
 from asca_deploy.ros2.messages import ERROR, OK, WARN, Stamp
 from asca_deploy.ros2.node import NodeSettings, reliability
-from asca_deploy.tracker import Tracker
-from asca_deploy.tracks import Tracks
+from asca_deploy.tracker import Tracker, Tracks
 from asca_pillars.base.errors import ConfigError, ScanError
 from asca_pillars.scans.mounting import Mounting
 from asca_pillars.scans.scan_settings import ScanSettings

@@ -11,7 +11,7 @@ pytest.importorskip("rosbags", reason="needs pip install -e '.[recordings]'")
 from asca_deploy import Detections
 from asca_deploy.ros2 import messages
 from asca_deploy.ros2.messages import Stamp, detection_array, diagnostic_array, filled, marker_array
-from asca_deploy.tracks import Tracks
+from asca_deploy.tracker import Tracks
 from asca_pillars.pictures.colors import class_shares
 from tests.deploy.ros2.ros_messages import built, store
 

@@ -27,8 +27,7 @@ from asca_pillars.detection.decode import VOTE_SCORE, HeadMaps
 from asca_pillars.models.pillar.network import PillarDetector
 from asca_pillars.models.scan_detector import ScanDetector
 from asca_pillars.ops.pillar.spec import PillarSpec
-from asca_pillars.scans.expected_input import ExpectedInput
-from asca_pillars.scans.measure_input import measure_expected_input
+from asca_pillars.scans.input_check import ExpectedInput, measure_expected_input
 from asca_pillars.scans.scan_reader import read_scan
 from tests.export.deployed import assert_same_boxes
 from tests.export.tiny import CHECKPOINTS, NOTHING, ONE_POINT, READINGS, SCANS, tiny_checkpoint, tiny_detector

@@ -12,7 +12,7 @@ from torch.nn import functional as F  # noqa: N812  (torch's own convention)
 from asca_deploy import Detector
 from asca_deploy.manifest import load_pillar_bundle
 from asca_export.bundle_writer import ExportOptions
-from asca_export.export import export_bundle
+from asca_export.export_checkpoint import export_bundle
 from asca_export.pillar.export import export_pillar_bundle
 from asca_export.pillar.masked_forms import NEVER, MarkedEncoder, MaskedBackbone
 from asca_export.two_stage.first_stage import BundleFirstStage

@@ -5,7 +5,7 @@ import dataclasses
 import torch
 from torch import nn
 
-from asca_pillars.models.checkpoint import Checkpoint
+from asca_pillars.models.build import Checkpoint
 from tests.export.tiny import SCANS
 from tests.models.pv_rcnn.tiny_pv_rcnn import MODEL, SPEC, batch, frame, tiny_config, tiny_detector
 

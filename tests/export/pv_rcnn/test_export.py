@@ -14,8 +14,7 @@ import torch
 from asca_deploy import Detector
 from asca_deploy.bundle import DEFORM, GRAPHS, PvRcnnBundle, PvRcnnSection
 from asca_deploy.manifest import load_bundle, load_pillar_bundle
-from asca_deploy.pv_rcnn.canvas import VoxelCanvas
-from asca_deploy.pv_rcnn.graphs import balls_around, deform_inputs, keeps_memory
+from asca_deploy.pv_rcnn.graphs import VoxelCanvas, balls_around, deform_inputs, keeps_memory
 from asca_deploy.pv_rcnn.pipeline import PvRcnnPipeline
 from asca_export.pv_rcnn.export import export_pv_rcnn_bundle
 from asca_export.pv_rcnn.graphs import export_deform
@@ -23,7 +22,7 @@ from asca_export.pv_rcnn.parity import check_pv_rcnn_parity
 from asca_pillars.base.errors import BundleError, ExportError
 from asca_pillars.config.pv_rcnn import PvRcnnModel
 from asca_pillars.config.tree import load_config
-from asca_pillars.models.checkpoint import Checkpoint, load_checkpoint
+from asca_pillars.models.build import Checkpoint, load_checkpoint
 from asca_pillars.models.pv_rcnn.network import PvRcnnDetector
 from asca_pillars.models.pv_rcnn.preparation import batch_scans
 from asca_pillars.ops.pv_rcnn.prepare import SourceBalls, voxel_scan

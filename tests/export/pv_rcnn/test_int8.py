@@ -24,7 +24,7 @@ from asca_export.pv_rcnn.export import export_pv_rcnn_bundle
 from asca_export.pv_rcnn.int8 import quantize_pv_rcnn_bundle
 from asca_export.pv_rcnn.voxel_forms import VoxelProducts, VoxelSample, scale_voxels_to_steps
 from asca_pillars.base.errors import BundleError, ExportError
-from asca_pillars.models.checkpoint import Checkpoint
+from asca_pillars.models.build import Checkpoint
 from asca_pillars.models.pv_rcnn.network import PvRcnnDetector
 from tests.export.pv_rcnn.random_checkpoint import CALIBRATION, random_checkpoint
 from tests.export.sweeps import remembered

@@ -23,8 +23,7 @@ from asca_export.two_stage.first_stage import open_exported
 from asca_export.two_stage.graphs import fold_norms
 from asca_export.two_stage.parity import check_refine_parity
 from asca_pillars.base.errors import BundleError, ExportError
-from asca_pillars.models.build import build_model
-from asca_pillars.models.checkpoint import Checkpoint, load_checkpoint
+from asca_pillars.models.build import Checkpoint, build_model, load_checkpoint
 from asca_pillars.models.pillar.network import PillarDetector
 from asca_pillars.models.two_stage.first_stage import with_first_stage
 from asca_pillars.models.two_stage.network import RefineDetector

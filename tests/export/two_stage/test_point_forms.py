@@ -9,9 +9,8 @@ import torch
 
 from asca_export.graphs import export_graph
 from asca_export.two_stage.graphs import GatheredSetAbstraction, GroupedSetAbstraction
-from asca_pillars.models.two_stage.sets import SetAbstraction
-from asca_pillars.ops.points.ball_layouts import BallGroup, GroupedBalls, gather_balls, group_balls
-from asca_pillars.ops.points.neighbors import ball_query
+from asca_pillars.models.two_stage.layers import SetAbstraction
+from asca_pillars.ops.points.neighbors import BallGroup, GroupedBalls, ball_query, gather_balls, group_balls
 from tests.ops.points.clouds import cloud
 
 WIDTHS = [(6,), (6, 5), (6, 5, 7)]

@@ -15,7 +15,7 @@ from asca_pillars.base.errors import ConfigError, TrainingError
 from asca_pillars.config.pillar import PillarModel
 from asca_pillars.config.pv_rcnn import PvRcnnModel
 from asca_pillars.config.tree import Config, load_config
-from asca_pillars.models.checkpoint import Checkpoint, load_checkpoint
+from asca_pillars.models.build import Checkpoint, load_checkpoint
 from asca_pillars.models.openpcdet.import_checkpoint import published_config, read_foreign, write_imported
 from asca_pillars.models.pillar.network import PillarDetector
 from asca_pillars.models.pv_rcnn.network import PvRcnnDetector

@@ -13,7 +13,7 @@ from asca_export.pillar.export import export_pillar_bundle
 from asca_pillars.base.errors import BundleError, ConfigError, TrainingError
 from asca_pillars.config.pillar import PillarModel
 from asca_pillars.config.tree import Config, load_config
-from asca_pillars.models.checkpoint import Checkpoint, load_checkpoint
+from asca_pillars.models.build import Checkpoint, load_checkpoint
 from asca_pillars.models.openpcdet.import_checkpoint import published_config, read_foreign, write_imported
 from asca_pillars.models.pillar.network import PillarDetector
 from tests.export.deployed import assert_same_detector

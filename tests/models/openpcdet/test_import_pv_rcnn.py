@@ -8,7 +8,7 @@ import torch
 
 from asca_pillars.config.pv_rcnn import PvRcnnModel
 from asca_pillars.config.tree import load_config
-from asca_pillars.models.checkpoint import load_checkpoint
+from asca_pillars.models.build import load_checkpoint
 from asca_pillars.models.openpcdet.import_checkpoint import published_config, read_foreign, write_imported
 from asca_pillars.models.pv_rcnn.layers import PvRcnn as OurNetwork
 from asca_pillars.models.pv_rcnn.network import PvRcnnDetector

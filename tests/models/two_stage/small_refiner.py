@@ -5,9 +5,8 @@ import torch
 
 from asca_pillars.data.frames import LabeledFrame
 from asca_pillars.detection.detections import Detections
-from asca_pillars.models.two_stage.layers import BallSource, KeypointEncoder, PillarRefiner, RoiHead
+from asca_pillars.models.two_stage.layers import BallSource, KeypointEncoder, PillarRefiner, RoiHead, SetAbstraction
 from asca_pillars.models.two_stage.preparation import RefineBatch, RefineSample, collate_samples, sample_of
-from asca_pillars.models.two_stage.sets import SetAbstraction
 from asca_pillars.ops.points.sampling import farthest_points
 from asca_pillars.ops.two_stage.first_stage import SecondStageInputs
 from asca_pillars.ops.two_stage.prepare import RefineSettings

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from asca_pillars.base.errors import ConfigError
+from asca_pillars.detection.anchors import KITTI_CLASSES, make_anchors
 from asca_pillars.detection.decode import HeadMaps
-from asca_pillars.detection.spec import KITTI_CLASSES, make_anchors
 from asca_pillars.ops.pillar.grid import PillarGrid
 from asca_pillars.ops.pillar.prepare import PillarLimits, pillarize
 from asca_pillars.ops.pillar.spec import PillarSpec

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from asca_pillars.detection.anchors import IGNORED
 from asca_pillars.detection.detections import Detections
-from asca_pillars.detection.spec import IGNORED
 from asca_pillars.geometry.boxes import corners, wrap_angle
 from asca_pillars.ops.two_stage.rois import (
     FOREGROUND_IOU,

@@ -21,8 +21,7 @@ from asca_pillars.scans.recordings.open_recording import is_recording, open_reco
 from asca_pillars.scans.recordings.packet_files import PacketCapture
 from asca_pillars.scans.recordings.point_cloud2 import read_point_cloud
 from asca_pillars.scans.recordings.recorded_scans import RecordedScan, RecordedScans
-from asca_pillars.scans.recordings.recording import Encoding, Message, Recording, Topic
-from asca_pillars.scans.recordings.scan_types import kind_of_scans
+from asca_pillars.scans.recordings.recording import Encoding, Message, Recording, Topic, kind_of_scans
 
 START_S = 1_700_000_000
 CAPTURES = os.environ.get("ASCA_OUSTER_CAPTURES")

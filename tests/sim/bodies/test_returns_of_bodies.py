@@ -10,8 +10,7 @@ import pytest
 from asca_pillars.evaluation.errors.label_fit import label_fit
 from asca_pillars.sim.bodies.cycles import bicycle, cyclist_body
 from asca_pillars.sim.bodies.people import SHARES, draw_burden, pedestrian_body
-from asca_pillars.sim.bodies.styles import draw_style
-from asca_pillars.sim.bodies.vehicles import car_body
+from asca_pillars.sim.bodies.vehicles import car_body, draw_style
 from asca_pillars.sim.report.label_statistics import COLUMNS, WINDOW_RETURNS, window_returns
 from asca_pillars.sim.scene_config import SceneConfig
 from asca_pillars.sim.world.placement import Target

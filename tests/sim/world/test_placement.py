@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from asca_pillars.sim.scene_config import SceneConfig
-from asca_pillars.sim.world.habits import Habits, Neighbor
-from asca_pillars.sim.world.placement import Occupied, Placer, Target, draw_size
+from asca_pillars.sim.world.placement import Habits, Neighbor, Occupied, Placer, Target, draw_size
 from asca_pillars.sim.world.scene import KEPT_CLEAR_M, draw_scene, place_objects
 from asca_pillars.sim.world.streets import draw_ground
 

@@ -11,7 +11,7 @@ from asca_pillars.base.errors import AscaError, DatasetError
 from asca_pillars.data.boxes.box_split import BoxSplit
 from asca_pillars.data.insertion.prepared import require_writable
 from asca_pillars.data.kitti import KittiSplit
-from asca_pillars.models.two_stage.proposal_cache import ProposalCache
+from asca_pillars.models.two_stage.preparation import ProposalCache
 from asca_pillars.ops.two_stage.first_stage import FirstStageSettings, run_first_stage
 from asca_pillars.scans.scan_reader import write_scan
 from tests.data.boxes.box_scenes import write_box_dataset

@@ -10,8 +10,7 @@ import torch
 from asca_pillars.base.errors import TrainingError
 from asca_pillars.config.pillar import NetworkConfig, PillarModel
 from asca_pillars.config.tree import Config
-from asca_pillars.models.build import build_model
-from asca_pillars.models.checkpoint import Checkpoint, load_checkpoint
+from asca_pillars.models.build import Checkpoint, build_model, load_checkpoint
 from asca_pillars.models.checkpoint_file import save_weights, weights_sha256
 from asca_pillars.models.openpcdet.import_checkpoint import read_foreign
 from asca_pillars.training.checkpoints import LAST, checkpoint_to_resume

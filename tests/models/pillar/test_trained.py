@@ -13,8 +13,8 @@ from asca_pillars.config.tree import Config
 from asca_pillars.config.two_stage import RefineModel
 from asca_pillars.detection.decode import HeadMaps
 from asca_pillars.models.checkpoint_file import read_checkpoint
-from asca_pillars.models.pillar.distillation import Distillation
 from asca_pillars.models.pillar.loss import FOREGROUND_SCORE, box_loss, distillation_loss
+from asca_pillars.models.pillar.trained import Distillation
 from asca_pillars.training.loop import train
 from tests.export.tiny import tiny_checkpoint
 from tests.helpers.saved_checkpoint import save_checkpoint

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
+from asca_deploy.detect_scans import require_one_folder, scan_times_ns
 from asca_pillars.base.errors import ConfigError, ScanError
-from asca_pillars.scans.scan_times import require_one_folder, scan_times_ns
 
 
 def test_times_by_a_rate_begin_at_0_and_those_of_a_file_are_its_seconds(tmp_path: Path) -> None:

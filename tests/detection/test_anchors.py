@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from asca_pillars.base.errors import ConfigError
-from asca_pillars.detection.spec import KITTI_CLASSES, ClassSpec, make_anchors
+from asca_pillars.detection.anchors import KITTI_CLASSES, ClassSpec, make_anchors
 from asca_pillars.ops.pillar.grid import PillarGrid
 
 GRID = PillarGrid(x_range_m=(2.0, 17.36), y_range_m=(-3.2, 7.04), z_range_m=(-2.5, 1.5))

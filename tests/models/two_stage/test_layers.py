@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch.nn import functional as F  # noqa: N812  (torch's own convention)
 
-from asca_pillars.models.two_stage.sets import SetAbstraction, VectorPool
+from asca_pillars.models.two_stage.layers import SetAbstraction, VectorPool
 from asca_pillars.ops.points.neighbors import nearest_in_cubes
 
 Balls: TypeAlias = tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]
