@@ -16,16 +16,14 @@ import yaml
 from asca_deploy import default_bundle_path
 from asca_deploy.manifest import load_pillar_bundle
 from asca_pillars.base.errors import ScanError
-from asca_pillars.base.schema import to_dict
-from asca_pillars.base.settings import shipped_configs
+from asca_pillars.base.settings import shipped_configs, to_dict
 from asca_pillars.config.tree import Config, load_config
 from asca_pillars.data.boxes.box_records import read_frame_file, read_frames, read_time
 from asca_pillars.data.kitti import KittiSplit, boxes_from_objects, objects_3d, read_calibration, read_labels
 from asca_pillars.evaluation.predictions import read_predictions, read_truth
 from asca_pillars.ops.pv_rcnn.spec import VoxelSpec
 from asca_pillars.scans.mounting import read_pose
-from asca_pillars.scans.recordings.open_recording import open_recording
-from asca_pillars.scans.recordings.recorded_scans import RecordedScans
+from asca_pillars.scans.recordings.recorded_scans import RecordedScans, open_recording
 from asca_pillars.scans.scan_reader import read_scan
 from asca_pillars.scans.transforms import read_poses
 from asca_pillars.sim.simulation import load_simulation_config

@@ -20,7 +20,7 @@ from asca_deploy.result_files import ResultWriter
 from asca_pillars.base.errors import AscaError, OutputError
 from asca_pillars.base.files import require_writable
 from asca_pillars.base.own_files import page_end
-from asca_pillars.base.schema import to_dict
+from asca_pillars.base.settings import to_dict
 from asca_pillars.base.system import describe_environment
 from asca_pillars.cluster.shards import Shard, ShardFolder
 from asca_pillars.config.tree import Config, load_config
@@ -34,7 +34,7 @@ from asca_pillars.evaluation.tracking.tracking_report import tracking_report
 from asca_pillars.pictures.visualize import png_bytes
 from asca_pillars.scans.scan_reader import read_scan, write_scan
 from asca_pillars.sim.simulation import require_own_frames
-from asca_pillars.training.run_folder import YAML_HEAD, require_own_run
+from asca_pillars.training.run_files import YAML_HEAD, require_own_run
 from benchmarks.fuzz_inputs import BOX, Kind
 
 CLASSES = ("Car", "Pedestrian")

@@ -13,7 +13,7 @@ import onnx
 from onnx import TensorProto, helper, numpy_helper
 
 import asca_deploy.benchmark
-from asca_deploy.benchmark.roofline import SIZE
+from asca_deploy.benchmark.timing import SIZE
 
 TILE = 64
 

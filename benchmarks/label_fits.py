@@ -19,8 +19,8 @@ from rich.progress import track
 from asca_pillars.cli.run_command import run_command
 from asca_pillars.data.kitti import KittiSplit, boxes_from_objects, objects_3d
 from asca_pillars.scans.scan_reader import read_scan
-from asca_pillars.sim.report.label_statistics import fits_of, object_fits
 from asca_pillars.sim.report.reference import CLASSES, Fit
+from asca_pillars.sim.report.scan_statistics import fits_of, object_fits
 from asca_pillars.sim.report.tables import fits_table
 
 

@@ -21,7 +21,7 @@ from rich.progress import track
 
 from asca_deploy import Detections, Detector
 from asca_pillars.base.errors import AscaError
-from asca_pillars.base.schema import parse
+from asca_pillars.base.settings import parse
 from asca_pillars.cli.run_command import run_command
 from asca_pillars.data.kitti import KittiSplit, boxes_from_objects, objects_3d
 from asca_pillars.detection.targets import match_by_overlap
@@ -32,9 +32,8 @@ from asca_pillars.geometry.boxes import points_in_boxes
 from asca_pillars.geometry.overlap import bev_iou
 from asca_pillars.scans.find_scans import find_scans
 from asca_pillars.scans.mounting import Mounting
-from asca_pillars.scans.scan_input import ScanInput
 from asca_pillars.scans.scan_reader import read_scan
-from asca_pillars.scans.scan_settings import ScanSettings
+from asca_pillars.scans.scan_settings import ScanInput, ScanSettings
 from asca_pillars.sim.simulation import load_simulation_config, simulate_frame
 
 FEWEST_POINTS, RANGE_M, SEAM_DEG = 5, 40.0, 6.0  # of the objects that `recall` counts; about a border of two passes

@@ -1,22 +1,13 @@
-"""`asca detect`: boxes of scans or a recording as tables, pictures, KITTI text and tracks.
+"""`asca detect`: boxes of scans or a recording as tables, pictures, KITTI text and tracks."""
 
-Tables of `asca detect`: one scan's boxes or a row per scan, and the time of every stage.
-"""
-
-import statistics
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, cast
 
-import numpy as np
 import typer
-from rich.console import Console
-from rich.table import Table
 
-from asca_deploy import Detector, FrameReport, ScanDetections
-from asca_deploy.detect_scans import DetectedScans
-from asca_pillars.base.errors import ConfigError, PartialError, printable
+from asca_pillars.base.errors import ConfigError, PartialError
 from asca_pillars.cli.options import (
     AxesOption,
     BundleOption,
@@ -38,7 +29,6 @@ from asca_pillars.cli.options import (
     scan_settings,
 )
 from asca_pillars.data.importing.formats import TOOLS
-from asca_pillars.detection.spec import DetectorSpec
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -47,63 +37,6 @@ if TYPE_CHECKING:
     from asca_deploy.detect_scans import DetectedScans
     from asca_deploy.recordings.detect_recording import RecordingResult
     from asca_pillars.pictures.video import VideoView
-
-
-def print_remark(console: Console, text: str) -> None:
-    """Print a line that the user is to notice; it may quote names of files and topics."""
-    console.print(printable(text), style="yellow", soft_wrap=True)
-
-
-def boxes_table(path: Path, detections: ScanDetections) -> Table:
-    """Return a table of the boxes of one scan, nearest first."""
-    table = Table(title=f"{path.name}: {len(detections)} objects")
-    for column in ("class", "score", "distance", "direction", "size l x w x h", "heading"):
-        table.add_column(column, justify="left" if column == "class" else "right")
-    bearings_deg = np.rad2deg(detections.bearings_rad)
-    for index in np.argsort(detections.distances_m):
-        length, width, height, yaw = detections.boxes[index, 3:]
-        table.add_row(
-            detections.names[index],
-            f"{detections.scores[index]:.2f}",
-            f"{detections.distances_m[index]:.1f} m",
-            _direction(bearings_deg[index]),
-            f"{length:.1f} x {width:.1f} x {height:.1f} m",
-            f"{np.rad2deg(yaw):+.0f}°",
-        )
-    return table
-
-
-def _direction(bearing_deg: float) -> str:
-    """Return a direction relative to straight ahead, such as "12° left" or "170° right"."""
-    angle = round(abs(bearing_deg))
-    return "ahead" if angle == 0 else f"{angle}° {'left' if bearing_deg > 0 else 'right'}"
-
-
-def scans_table(results: DetectedScans, spec: DetectorSpec) -> Table:
-    """Return a table with the number of objects of each class, a row per scan."""
-    table = Table(title=f"{len(results)} scans")
-    for column in ("scan", "points", *spec.class_names, "time"):
-        table.add_column(column, justify="left" if column == "scan" else "right")
-    for result in results:
-        report = result.detections.report
-        counts = map(str, np.bincount(result.detections.labels, minlength=len(spec.classes)))
-        table.add_row(
-            result.path.name, str(report.counts.points // report.passes), *counts, f"{report.total_ms:.0f} ms"
-        )
-    return table
-
-
-def timing_line(reports: Sequence[FrameReport], detector: Detector) -> str:
-    """Return the median times of frames after the warm-up, by stage."""
-    medians = {stage: statistics.median(one.times_ms[stage] for one in reports) for stage in reports[0].times_ms}
-    total_ms = statistics.median(report.total_ms for report in reports)
-    stages = " + ".join(f"{stage} {value:.1f}" for stage, value in medians.items())
-    passes = f" in {detector.passes} passes" if detector.passes > 1 else ""
-    return (
-        f"{1e3 / total_ms:.1f} FPS: {total_ms:.1f} ms per scan{passes} (median of {len(reports)} warm frames, "
-        f"{detector.runs_on}, {detector.threads} threads): {stages} ms"
-    )
-
 
 TIMED_FRAMES = 6  # least number of frames; the first one, the warm-up, is left out
 
@@ -259,7 +192,7 @@ def detect(
     from asca_deploy import sample_scan_path
     from asca_deploy.open_model import RuntimeOptions
     from asca_pillars.cli.progress import Bars
-    from asca_pillars.scans.recordings.open_recording import is_recording
+    from asca_pillars.scans.recordings.recorded_scans import is_recording
 
     console = Console(markup=False)
     logging.getLogger("asca_pillars").setLevel(logging.ERROR)  # its warnings are printed below, with the scan's name
@@ -385,19 +318,20 @@ def _write_labels(out: Path, name: str | None, console: "Console") -> None:
 def _print_scans(found: "DetectedScans", files: Sequence[Path], out: Path, console: "Console") -> None:
     """Print boxes or a line per scan, remarks and times; PartialError if some scans failed."""
     from asca_deploy.auto import summary
+    from asca_pillars.cli import detect_tables as show
 
     detector = found.detector
     if detector.candidates:
         console.print(summary(detector.runs_on, detector.candidates), soft_wrap=True)
     asked = len(found) + found.unreadable
     one = asked == 1
-    console.print(boxes_table(found[0].path, found[0].detections) if one else scans_table(found, detector.spec))
+    console.print(show.boxes(found[0].path, found[0].detections) if one else show.scans(found, detector.spec))
     for line in found.remarks:
-        print_remark(console, line)
+        show.remark(console, line)
     reports = [scan.detections.report for scan in found]
     while len(reports) < TIMED_FRAMES:
         reports.append(detector(found.last_points).report)
-    console.print(timing_line(reports[1:], detector))
+    console.print(show.timing(reports[1:], detector))
     console.print(f"Results: {', '.join([f'{out}/', *map(str, files)])}", soft_wrap=True)
     if unwritten := len(found.failed) - found.unreadable:
         raise PartialError(f"results of {unwritten} of {asked} scans could not be written; they are named above")

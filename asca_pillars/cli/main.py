@@ -15,14 +15,12 @@ from asca_pillars.cli.detect import detect
 from asca_pillars.cli.doctor import doctor
 from asca_pillars.cli.eval import evaluate
 from asca_pillars.cli.export import export
-from asca_pillars.cli.import_dataset import import_dataset
-from asca_pillars.cli.import_weights import import_weights
+from asca_pillars.cli.import_dataset import import_dataset, import_weights
 from asca_pillars.cli.inspect import inspect
-from asca_pillars.cli.prepare import prepare
 from asca_pillars.cli.ros2 import ros2
 from asca_pillars.cli.run_command import run_command
 from asca_pillars.cli.simulate import simulate
-from asca_pillars.cli.train import train
+from asca_pillars.cli.train import prepare, train
 from asca_pillars.cli.view import view
 
 app = typer.Typer(

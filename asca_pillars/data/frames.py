@@ -15,9 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_pillars.detection.anchors import IGNORED
-from asca_pillars.geometry.boxes import points_in_boxes
+from asca_pillars.geometry.boxes import Ranges, points_in_boxes
 from asca_pillars.geometry.frame_change import FrameChange
-from asca_pillars.geometry.ranges import Ranges
 from asca_pillars.scans.mounting import Mounting
 
 # Types that KITTI's evaluation counts neither as true nor as false positives of a class.

@@ -15,8 +15,7 @@ from asca_pillars.base.strict import Strict
 from asca_pillars.detection.anchors import KITTI_CLASSES, ClassSpec, make_anchors
 from asca_pillars.detection.decode import HeadMaps, PostProcess, decode
 from asca_pillars.detection.detections import Detections
-from asca_pillars.geometry.boxes import DIRECTION_OFFSET_RAD
-from asca_pillars.geometry.ranges import Ranges
+from asca_pillars.geometry.boxes import DIRECTION_OFFSET_RAD, Ranges
 
 ScoreThresholds: TypeAlias = float | Mapping[str, float]
 """One score for every class, or scores of some classes by name."""

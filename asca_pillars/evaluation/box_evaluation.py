@@ -7,18 +7,29 @@ from asca_pillars.base.errors import ConfigError, DatasetError
 from asca_pillars.base.files import atomic_directory, write_json
 from asca_pillars.base.progress import Reporter
 from asca_pillars.base.system import describe_environment
-from asca_pillars.data.boxes.box_split import BoxSplit
+from asca_pillars.data.boxes.box_split import BoxSplit, open_split
 from asca_pillars.data.boxes.detector_scope import detector_scope
 from asca_pillars.data.frames import LabeledSplit
-from asca_pillars.data.open_split import open_split
-from asca_pillars.evaluation.arguments import Evaluation, EvaluationTask
+from asca_pillars.evaluation.arguments import (
+    Evaluation,
+    EvaluationTask,
+    Model,
+    OpenModel,
+    model_scores,
+    scores_by_class,
+)
 from asca_pillars.evaluation.boxes.box_predictions import BoxFrames, read_box_predictions, write_box_predictions
 from asca_pillars.evaluation.boxes.box_report import BoxProtocol, box_json, box_notes, box_report, box_tables
 from asca_pillars.evaluation.boxes.iou_metrics import fixed_scores
-from asca_pillars.evaluation.errors.analysis import predictions_name, prepare_errors, report_errors
 from asca_pillars.evaluation.errors.error_frames import BoxErrorFrames
-from asca_pillars.evaluation.kitti_evaluation import TEXT_SCORE, warn_of_degrees, warn_of_unusual_scans
-from asca_pillars.evaluation.model import Model, OpenModel, model_scores, scores_by_class
+from asca_pillars.evaluation.kitti_evaluation import (
+    TEXT_SCORE,
+    predictions_name,
+    prepare_errors,
+    report_errors,
+    warn_of_degrees,
+    warn_of_unusual_scans,
+)
 from asca_pillars.evaluation.report_files import MADE_BY, PREDICTIONS_FOLDER, check_output_folder, write_report
 from asca_pillars.evaluation.report_page import ReportPage
 

@@ -16,7 +16,7 @@ from asca_pillars.base.own_files import page_end
 from asca_pillars.base.progress import SILENT, Reporter
 from asca_pillars.data.kitti import Calibration, KittiObject, KittiSplit, boxes_from_objects, in_image, read_labels
 from asca_pillars.evaluation.kitti.score_threshold import ScoreMatches
-from asca_pillars.geometry.ranges import Ranges
+from asca_pillars.geometry.boxes import Ranges
 from asca_pillars.pictures.drawing import BACKGROUND, BoxLayer, Color, Image, Texts
 from asca_pillars.pictures.gallery_page import GalleryCard, gallery_page
 from asca_pillars.pictures.visualize import draw_layers, draw_on_image, read_image, write_png

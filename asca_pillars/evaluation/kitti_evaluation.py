@@ -1,4 +1,7 @@
-"""Evaluation by KITTI's and Waymo's protocols: running the model, reports and pictures."""
+"""Evaluation by KITTI's and Waymo's protocols: running the model, reports and pictures.
+
+Preparation of an error analysis: datasets to compare, and the report.
+"""
 
 import json
 from collections.abc import Sequence
@@ -15,18 +18,31 @@ from asca_pillars.base.installation import install_command, missing_modules
 from asca_pillars.base.own_files import is_own_picture, require_own_file
 from asca_pillars.base.progress import Reporter
 from asca_pillars.base.system import describe_environment
+from asca_pillars.data.boxes.box_records import check_yaws
+from asca_pillars.data.frames import LabeledSplit
 from asca_pillars.data.kitti import KittiSplit
-from asca_pillars.data.yaw_units import check_yaws
 from asca_pillars.detection.spec import ScoreThresholds
 from asca_pillars.evaluation import gallery
-from asca_pillars.evaluation.arguments import Evaluation, EvaluationTask
-from asca_pillars.evaluation.curves import write_curves
-from asca_pillars.evaluation.errors.analysis import ErrorAnalysis, predictions_name, prepare_errors, report_errors
-from asca_pillars.evaluation.errors.error_frames import KittiErrorFrames
+from asca_pillars.evaluation.arguments import (
+    Evaluation,
+    EvaluationTask,
+    Model,
+    OpenModel,
+    model_scores,
+    scores_by_class,
+)
+from asca_pillars.evaluation.errors.error_frames import ErrorFrames, KittiErrorFrames
+from asca_pillars.evaluation.errors.error_report import ErrorReport, parts_of, read_report, write_errors
 from asca_pillars.evaluation.kitti.average_precision import CLASS_NAMES, DIFFICULTIES, evaluate
-from asca_pillars.evaluation.kitti.kitti_report import BANDS_M, KittiReport, kitti_json, kitti_notes, kitti_tables
+from asca_pillars.evaluation.kitti.kitti_report import (
+    BANDS_M,
+    KittiReport,
+    kitti_json,
+    kitti_notes,
+    kitti_tables,
+    write_curves,
+)
 from asca_pillars.evaluation.kitti.score_threshold import best_scores, matches_at_score, operating_points
-from asca_pillars.evaluation.model import Model, OpenModel, model_scores, scores_by_class
 from asca_pillars.evaluation.predictions import ScoredFrames, read_predictions, read_truth, write_predictions
 from asca_pillars.evaluation.report_files import (
     COMMAND,
@@ -47,8 +63,75 @@ from asca_pillars.evaluation.waymo import (
     waymo_notes,
     waymo_table,
 )
-from asca_pillars.geometry.ranges import Ranges
+from asca_pillars.geometry.boxes import Ranges
 from asca_pillars.ops.pillar.grid import PillarGrid
+
+
+@dataclass(frozen=True)
+class ErrorAnalysis:
+    """Inputs of an error analysis.
+
+    Attributes:
+        name: name of the data in the tables.
+        parts: frame ids of each part of the data, by its name.
+        beside: reports of other evaluations.
+    """
+
+    name: str
+    parts: dict[str, list[str]]
+    beside: tuple[ErrorReport, ...]
+
+
+def prepare_errors(who: str, split: LabeledSplit, by: str | None, beside: Sequence[Path]) -> ErrorAnalysis:
+    """Read the inputs of an error analysis: before a model runs, so that errors are found early.
+
+    Args:
+        who: name of the model or its predictions.
+        split: the frames.
+        by: see `evaluation.errors.error_report.parts_of`; None for no parts.
+        beside: errors.json of other evaluations, for the same tables.
+
+    Raises:
+        ConfigError, DatasetError: as `parts_of` and `read_report`.
+    """
+    root = Path(split.root)
+    where = f"{who} {root.resolve().name}"
+    parts = {} if by is None else parts_of(root, split.name, split.frame_ids, by)
+    named = {f"{where}/{part}": ids for part, ids in parts.items()}
+    return ErrorAnalysis(f"{where}/{split.name}", named, tuple(read_report(path) for path in beside))
+
+
+def predictions_name(predictions: Path) -> str:
+    """Return the model's name if `asca eval` wrote the predictions, else that of the file or folder."""
+    made_by = (predictions if predictions.is_dir() else predictions.parent) / MADE_BY
+    try:
+        return str(json.loads(made_by.read_text(encoding="utf-8"))["model"]["name"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return predictions.name
+
+
+def report_errors(
+    analysis: ErrorAnalysis,
+    frames: ErrorFrames,
+    scores: dict[str, float],
+    subject: str,
+    about: dict[str, Any],
+    out: Path,
+    reporter: Reporter,
+) -> ReportPage:
+    """Analyze the errors and write the report; `scores` has the classes to evaluate."""
+    return write_errors(
+        frames,
+        scores,
+        subject=subject,
+        name=analysis.name,
+        parts=analysis.parts,
+        beside=analysis.beside,
+        about=about,
+        out=out,
+        reporter=reporter,
+    )
+
 
 GALLERY_FRAMES = 8
 TEXT_SCORE = 0.3  # KITTI text does not state the detector's score threshold

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_pillars.base.errors import DatasetError
-from asca_pillars.base.input_files import read_text
+from asca_pillars.base.files import read_text
 from asca_pillars.base.progress import SILENT, Reporter
 from asca_pillars.data.kitti import KittiSplit, in_image, objects_from_boxes, read_labels, write_labels
 from asca_pillars.detection.detections import Detections
@@ -143,7 +143,7 @@ def write_predictions(
     Args:
         folder: folder for NAME.txt of each frame, an empty file without detections.
         split: the frames; their scans and calibrations are read, their labels are not.
-        detect: (N, 4) points -> detections, for instance `asca_deploy.Detector` or `models.scan_detector.ScanDetector`.
+        detect: (N, 4) points -> detections, for instance `asca_deploy.Detector` or `models.build.ScanDetector`.
         camera_view: give the detector only the points in the image, as in its training.
         reporter: for the progress.
 

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from asca_pillars.geometry.ranges import Ranges
+from asca_pillars.geometry.boxes import Ranges
 from asca_pillars.pictures.colors import HEIGHT_SPAN_M, height_rgb
 
 Image = NDArray[np.uint8]

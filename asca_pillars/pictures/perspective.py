@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_pillars.data.kitti.calibration import BOX_EDGES
-from asca_pillars.geometry.boxes import corners, points_in_boxes
-from asca_pillars.geometry.ranges import Ranges
+from asca_pillars.geometry.boxes import Ranges, corners, points_in_boxes
 from asca_pillars.pictures.colors import ground_height, height_rgb
 from asca_pillars.pictures.drawing import (
     BACKGROUND,

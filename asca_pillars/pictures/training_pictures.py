@@ -8,8 +8,8 @@ import numpy as np
 from asca_pillars.base.files import atomic_directory, portable_name, write_json
 from asca_pillars.base.own_files import json_object, require_replaceable
 from asca_pillars.config.tree import Config
+from asca_pillars.data.augment import TrainingFrames, open_frames
 from asca_pillars.data.frames import LabeledFrame, Motion, within_ranges
-from asca_pillars.data.training_frames import TrainingFrames, open_frames
 from asca_pillars.detection.anchors import IGNORED
 from asca_pillars.pictures.drawing import BoxLayer, Image
 from asca_pillars.pictures.visualize import class_color, draw_layers, write_png

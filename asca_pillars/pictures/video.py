@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from asca_pillars.base.errors import AscaError, ConfigError
 from asca_pillars.base.installation import install_command
 from asca_pillars.detection.detections import Detections
+from asca_pillars.geometry.boxes import Ranges
 from asca_pillars.geometry.frame_change import FrameChange
-from asca_pillars.geometry.ranges import Ranges
 from asca_pillars.pictures.colors import ground_height
 from asca_pillars.pictures.drawing import Image, Texts, Trail
 from asca_pillars.pictures.perspective import draw_chase

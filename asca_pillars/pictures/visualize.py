@@ -15,8 +15,7 @@ from asca_pillars.base.files import atomic_path
 from asca_pillars.base.own_files import PICTURE_SOFTWARE
 from asca_pillars.data.kitti.calibration import Calibration, project_edges
 from asca_pillars.detection.detections import Detections
-from asca_pillars.geometry.boxes import footprints
-from asca_pillars.geometry.ranges import Ranges
+from asca_pillars.geometry.boxes import Ranges, footprints
 from asca_pillars.pictures.colors import class_rgb, ground_height, height_rgb
 from asca_pillars.pictures.drawing import (
     BACKGROUND,

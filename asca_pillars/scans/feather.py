@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from asca_pillars.base.errors import AscaError, ScanError
-from asca_pillars.base.input_files import require_content
+from asca_pillars.base.files import require_content
 from asca_pillars.base.installation import install_command
 from asca_pillars.scans.records import StoredPoints
 

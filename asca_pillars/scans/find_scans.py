@@ -10,8 +10,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from asca_pillars.base.errors import ScanError
-from asca_pillars.base.files import is_hidden
-from asca_pillars.base.input_files import require_content
+from asca_pillars.base.files import is_hidden, require_content
 
 SCAN_SUFFIXES = (".bin", ".npy", ".pcd", ".ply", ".feather")
 PREPARED_FILE = "README.txt"

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_pillars.base.errors import ConfigError
-from asca_pillars.base.input_files import read_text
+from asca_pillars.base.files import read_text
 from asca_pillars.base.strict import Strict
 from asca_pillars.geometry.frame_change import FrameChange, is_rigid
 

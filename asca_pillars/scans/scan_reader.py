@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_pillars.base.errors import ScanError
-from asca_pillars.base.files import atomic_path
-from asca_pillars.base.input_files import require_content
+from asca_pillars.base.files import atomic_path, require_content
 from asca_pillars.scans.feather import read_feather
 from asca_pillars.scans.find_scans import SCAN_SUFFIXES
 from asca_pillars.scans.pcd import read_pcd

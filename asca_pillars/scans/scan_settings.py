@@ -1,10 +1,17 @@
-"""Settings of scan reading and sensor mounting, shared by the options of commands and the keys of a dataset.yaml."""
+"""Settings of scan reading and sensor mounting, shared by the options of commands and the keys of a dataset.yaml.
+
+Reading of scan files by `ScanSettings`, with the mounting of their sensor.
+
+Scans with their stored values, and one reflectance scale for scans of the same source.
+"""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from itertools import groupby
 from math import inf
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +20,8 @@ from asca_pillars.base.errors import ConfigError, ScanError
 from asca_pillars.base.strict import Strict
 from asca_pillars.scans.ground_height import HeightEstimate, NamedPoints, estimate_named_height
 from asca_pillars.scans.mounting import Mounting, read_pose, refuse_axes_with_pose
-from asca_pillars.scans.scan_reader import ReflectanceScale
+from asca_pillars.scans.records import StoredPoints
+from asca_pillars.scans.scan_reader import ReflectanceScale, Scan, ambiguity, decide_scale, read_scan, read_stored
 
 FEWEST_COLUMNS = 3
 SAMPLE_SCANS = 8  # with visible ground: a height of "auto" is their median
@@ -103,3 +111,118 @@ def sample_points(paths: Sequence[Path], read: Callable[[Path], NDArray[np.float
             continue  # reported when it is read
         if len(points):
             yield NamedPoints(str(path), points)
+
+
+class FolderScale(NamedTuple):
+    """Reflectance scale of scans of the same source, and the reason why it may be wrong, if any."""
+
+    scale: ReflectanceScale
+    doubt: str | None
+
+
+def folder_reflectance_scale(paths: Sequence[Path], *, columns: int | None = None, sample: int = 16) -> FolderScale:
+    """Return one reflectance scale for scans of the same source, from `sample` of them, evenly spaced.
+
+    A dark scan among brighter ones is then read on the same scale. Scans that cannot be read, or have no points,
+    are ignored; where none has reflectances, the scale is auto.
+    """
+    chosen = paths if len(paths) <= sample else [paths[i * len(paths) // sample] for i in range(sample)]
+    stored = []
+    for path in chosen:
+        with suppress(ScanError):
+            stored.append(read_stored(path, columns))
+    return common_reflectance_scale(stored)
+
+
+def common_reflectance_scale(stored: Sequence[StoredPoints]) -> FolderScale:
+    """Return one reflectance scale for scans of the same source: the largest scale of any of them.
+
+    Auto where none of them has reflectances; scans without points are ignored.
+    """
+    samples = [(one.reflectance, one.dtype) for one in stored if one.reflectance is not None and has_finite_point(one)]
+    if not samples:
+        return FolderScale("auto", None)
+    decided = [decide_scale(*one) for one in samples]
+    scale = max(scale for scale, _ in decided)
+    guessed = any(by_values for _, by_values in decided)
+    doubts = [ambiguity(values, scale) for values, _ in samples] if guessed else [None]
+    return FolderScale(scale, doubts[0] if all(doubts) else None)
+
+
+def has_finite_point(stored: StoredPoints) -> bool:
+    """Return whether a point has only finite numbers: drivers send scans without any while a sensor starts."""
+    finite = np.isfinite(stored.xyz).all(axis=1)
+    return bool((finite if stored.reflectance is None else finite & np.isfinite(stored.reflectance)).any())
+
+
+def stored_points(path: Path, *, columns: int | None = 4) -> NDArray[np.float32]:
+    """Read the stored values of a scan, (N, 4): of any reflectance scale, possibly not finite.
+
+    Args:
+        path: the file.
+        columns: float32 values per point of a `.bin`, as in `read_scan`.
+
+    Raises:
+        ScanError: as `read_scan`.
+    """
+    stored = read_stored(path, columns)
+    reflectance = np.zeros(len(stored.xyz)) if stored.reflectance is None else stored.reflectance
+    return np.column_stack([stored.xyz, reflectance.astype(np.float32)]).astype(np.float32, copy=False)
+
+
+class ScanInput:
+    """Reader of scans; the reflectance scale of each folder and suffix is decided once.
+
+    Attributes:
+        paths: of the scans.
+        mounting: mounting of the sensor.
+        notes: sentences for the user about the settings that were chosen.
+
+    Raises:
+        ConfigError, ScanError: an option cannot be used, or the height cannot be estimated.
+    """
+
+    def __init__(self, settings: ScanSettings, paths: Sequence[Path]) -> None:
+        self._columns = settings.columns
+        self.paths = paths
+        self._scales: dict[tuple[Path, str], FolderScale] = {}
+        self.notes: list[str] = []
+        stated = settings.reflectance_scale
+        for key, group in groupby(sorted(paths, key=_folder_and_suffix), _folder_and_suffix):
+            self._scales[key] = self._decide(key[0], list(group)) if stated == "auto" else FolderScale(stated, None)
+        self.mounting, estimate = settings.mounting(self.samples())
+        if estimate is not None:
+            self.notes.append(f"sensor height: {estimate}")
+
+    def read(self, path: Path) -> Scan:
+        """Read one of the scans.
+
+        Raises:
+            ScanError: as `read_scan`.
+        """
+        return read_scan(path, columns=self._columns, reflectance_scale=self.scale(path))
+
+    def samples(self) -> Iterator[NamedPoints]:
+        """Yield some of the scans, see `sample_points`."""
+        return sample_points(self.paths, lambda path: self.read(path).points)
+
+    def scale(self, path: Path) -> ReflectanceScale:
+        """Return the reflectance scale of one of the scans."""
+        return self._scales[_folder_and_suffix(path)].scale
+
+    def _decide(self, folder: Path, paths: list[Path]) -> FolderScale:
+        where = folder if len(paths) > 1 else paths[0]
+        decided = folder_reflectance_scale(paths, columns=self._columns)
+        self.notes += [f"{where}: {line}" for line in scale_notes(decided)]
+        return decided
+
+
+def scale_notes(decided: FolderScale) -> list[str]:
+    """Return a sentence for the user about a scale that was decided by the values, or none."""
+    if decided.scale in (1.0, "auto"):
+        return []
+    return [decided.doubt or f"reflectances were taken as 0..{decided.scale:g} (--reflectance-scale {decided.scale:g})"]
+
+
+def _folder_and_suffix(path: Path) -> tuple[Path, str]:
+    return path.parent, path.suffix.lower()

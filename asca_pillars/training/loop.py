@@ -22,30 +22,27 @@ from asca_pillars.base.progress import Reporter
 from asca_pillars.config.pillar import PillarModel
 from asca_pillars.config.tree import Config, ModelConfig, TrainConfig
 from asca_pillars.config.two_stage import RefineModel
-from asca_pillars.data.open_split import open_split
-from asca_pillars.data.require_boxes import require_boxes
+from asca_pillars.data.boxes.box_split import open_split
 from asca_pillars.models.checkpoint_file import save_weights
 from asca_pillars.models.pillar.trained import Distillation
 from asca_pillars.models.two_stage.first_stage import with_first_stage
-from asca_pillars.training.callbacks import SaveOnInterrupt, StepProgress, weight_average
-from asca_pillars.training.checkpoints import (
+from asca_pillars.training.callbacks import (
     LAST,
     AtomicCheckpointIO,
     BestCheckpoint,
     LastCheckpoint,
+    SaveOnInterrupt,
+    StepProgress,
     checkpoint_to_resume,
     initial_weights,
     steps_of,
+    weight_average,
 )
+from asca_pillars.training.dataset import require_boxes
 from asca_pillars.training.loaders import DetectionData
 from asca_pillars.training.module import DetectionModule, has_bfloat16, resolve_precision
-from asca_pillars.training.run_folder import (
-    COMMAND,
-    TrainingInputs,
-    claim_run_folder,
-    measure_input,
-    recorded_precision,
-)
+from asca_pillars.training.run_files import COMMAND
+from asca_pillars.training.run_folder import TrainingInputs, claim_run_folder, measure_input, recorded_precision
 
 SANITY_STEPS = 2  # validation batches that run before the first training step
 

@@ -47,7 +47,7 @@ def train(
     """
     settings = config if isinstance(config, Config) else load_config(config, override)
     require("train")
-    from asca_pillars.training.run_folder import require_own_run
+    from asca_pillars.training.run_files import require_own_run
 
     init = None if init is None else Path(init)
     require_own_run(Path(out), init)

@@ -23,8 +23,8 @@ from asca_deploy.bundle import Bundle, PillarBundle
 from asca_pillars.base.errors import ConfigError
 from asca_pillars.detection.decode import nms_by_class
 from asca_pillars.detection.detections import Detections
+from asca_pillars.geometry.boxes import Ranges
 from asca_pillars.geometry.frame_change import FrameChange
-from asca_pillars.geometry.ranges import Ranges
 from asca_pillars.ops.pillar.grid import NECK_STRIDE
 from asca_pillars.scans.ground_height import fit_ground_plane
 

@@ -17,8 +17,7 @@ from pathlib import Path
 from asca_deploy.bundle import MANIFEST
 from asca_deploy.manifest import load_pillar_bundle, read_manifest
 from asca_pillars.base.errors import BundleError, ConfigError
-from asca_pillars.base.files import atomic_directory, atomic_path, write_json
-from asca_pillars.base.input_files import require_content
+from asca_pillars.base.files import atomic_directory, atomic_path, require_content, write_json
 from asca_pillars.base.own_files import json_object, require_not_input, require_own_file, require_replaceable
 from asca_pillars.pictures.colors import color_table, height_table
 from asca_pillars.scans.scan_reader import read_scan, write_scan

@@ -30,16 +30,15 @@ from asca_pillars.base.files import atomic_path
 from asca_pillars.base.installation import require
 from asca_pillars.base.own_files import json_object, require_own
 from asca_pillars.base.progress import Progress, Remark, Reporter
-from asca_pillars.base.schema import to_dict
+from asca_pillars.base.settings import to_dict
 from asca_pillars.base.system import package_versions
 from asca_pillars.cluster.run_shards import run_shards
 from asca_pillars.cluster.shards import RUN_SETTINGS, Shard, ShardFolder, make_shards
 from asca_pillars.data.boxes.detector_scope import detector_scope
 from asca_pillars.detection.spec import ScoreThresholds
 from asca_pillars.scans.mounting import Mounting
-from asca_pillars.scans.scan_input import ScanInput
 from asca_pillars.scans.scan_reader import ReflectanceScale, Scan, read_scan
-from asca_pillars.scans.scan_settings import ScanSettings
+from asca_pillars.scans.scan_settings import ScanInput, ScanSettings
 
 SHARDS = "shards"
 _SHARD_SCANS = (16, 256)

@@ -25,15 +25,14 @@ from asca_deploy.scan_detections import ScanDetections
 from asca_deploy.shipped import sample_scan_path
 from asca_deploy.tracker import Tracker, Tracks
 from asca_pillars.base.errors import ConfigError, ScanError, printable
-from asca_pillars.base.input_files import read_text
+from asca_pillars.base.files import read_text
 from asca_pillars.base.progress import Progress, Remark, Reporter
 from asca_pillars.data.boxes.detector_scope import detector_scope
 from asca_pillars.detection.spec import ScoreThresholds
 from asca_pillars.pictures.video import VideoView
 from asca_pillars.scans.find_scans import name_scans
-from asca_pillars.scans.scan_input import ScanInput
 from asca_pillars.scans.scan_reader import ScanNotes
-from asca_pillars.scans.scan_settings import ScanSettings
+from asca_pillars.scans.scan_settings import ScanInput, ScanSettings
 
 RATE_HZ = 10.0
 """Default rate of scans."""

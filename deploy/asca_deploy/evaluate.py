@@ -9,8 +9,14 @@ from asca_deploy.open_model import RuntimeOptions, open_model
 from asca_pillars.base.errors import ConfigError
 from asca_pillars.base.progress import Progress, Remark, Reporter
 from asca_pillars.detection.spec import ScoreThresholds
-from asca_pillars.evaluation.arguments import Evaluation, EvaluationTask, check_arguments, default_protocol
-from asca_pillars.evaluation.model import MIN_SCORE, Model
+from asca_pillars.evaluation.arguments import (
+    MIN_SCORE,
+    Evaluation,
+    EvaluationTask,
+    Model,
+    check_arguments,
+    default_protocol,
+)
 
 Protocol: TypeAlias = Literal["kitti", "waymo", "iou", "distance", "tracking"]
 _PLAIN = RuntimeOptions()

@@ -20,18 +20,16 @@ from asca_pillars.base.installation import require
 from asca_pillars.base.progress import Progress, Reporter
 from asca_pillars.data.inspection.inspect_dataset import Spread, spread
 from asca_pillars.detection.detections import ScanCounts
+from asca_pillars.geometry.boxes import Ranges
 from asca_pillars.geometry.frame_change import FrameChange
-from asca_pillars.geometry.ranges import Ranges
 from asca_pillars.scans.find_scans import name_scans
 from asca_pillars.scans.ground_height import HeightEstimate, NamedPoints
 from asca_pillars.scans.input_check import ExpectedInput, check_input, ground_z_m
 from asca_pillars.scans.mounting import Mounting
-from asca_pillars.scans.recordings.open_recording import is_recording, open_recording
-from asca_pillars.scans.recordings.recorded_scans import RecordedScan, RecordedScans
+from asca_pillars.scans.recordings.recorded_scans import RecordedScan, RecordedScans, is_recording, open_recording
 from asca_pillars.scans.recordings.recording import Topic
-from asca_pillars.scans.scan_input import ScanInput, scale_notes
 from asca_pillars.scans.scan_reader import Scan, ScanNotes
-from asca_pillars.scans.scan_settings import ScanSettings, sample_points
+from asca_pillars.scans.scan_settings import ScanInput, ScanSettings, sample_points, scale_notes
 
 FRAMES = 500
 GAP = 1.5

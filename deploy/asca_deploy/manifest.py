@@ -31,10 +31,9 @@ from asca_deploy.bundle import (
     PvRcnnBundle,
 )
 from asca_pillars.base.errors import AscaError, BundleError, printable
-from asca_pillars.base.files import write_json
-from asca_pillars.base.input_files import require_content
+from asca_pillars.base.files import require_content, write_json
 from asca_pillars.base.installation import upgrade_advice
-from asca_pillars.base.schema import parse, to_dict
+from asca_pillars.base.settings import parse, to_dict
 from asca_pillars.detection.anchors import ANCHOR_YAWS_RAD
 from asca_pillars.geometry.boxes import DIRECTION_OFFSET_RAD
 from asca_pillars.ops.pillar.prepare import FEATURES

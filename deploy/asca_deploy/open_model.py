@@ -21,11 +21,11 @@ from asca_pillars.base.system import check_threads
 from asca_pillars.data.kitti import calibration_of_scan
 from asca_pillars.detection.detections import Detections
 from asca_pillars.detection.spec import ScoreThresholds
-from asca_pillars.evaluation.model import Model
+from asca_pillars.evaluation.arguments import Model
 from asca_pillars.scans.ground_height import NamedPoints
 from asca_pillars.scans.input_check import share_behind
 from asca_pillars.scans.mounting import Mounting
-from asca_pillars.scans.scan_input import ScanInput
+from asca_pillars.scans.scan_settings import ScanInput
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -171,7 +171,7 @@ def _open_bundle(options: RuntimeOptions, min_score: float, mounting: Mounting, 
 
 def _open_checkpoint(path: Path, options: RuntimeOptions, min_score: float, mounting: Mounting) -> Model:
     require("train")
-    from asca_pillars.models.scan_detector import open_checkpoint
+    from asca_pillars.models.build import open_checkpoint
 
     provider, precision, threads = options.provider, options.precision, options.threads
     if threads is not None:

@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from asca_deploy.scan_detections import ScanDetections
 from asca_deploy.tracker import Tracks
 from asca_pillars.base.errors import AscaError, DatasetError
-from asca_pillars.base.files import atomic_path, write_json, write_text
-from asca_pillars.base.input_files import require_content
+from asca_pillars.base.files import atomic_path, require_content, write_json, write_text
 from asca_pillars.base.locks import recover
 from asca_pillars.base.own_files import (
     Recognizer,
@@ -29,9 +28,9 @@ from asca_pillars.base.own_files import (
     require_own,
     require_own_file,
 )
+from asca_pillars.data.boxes.box_split import labels_of_scan
 from asca_pillars.data.boxes.detector_scope import DetectorScope
 from asca_pillars.data.kitti import Calibration, calibration_of_scan, is_detection_text, read_calibration
-from asca_pillars.data.open_split import labels_of_scan
 from asca_pillars.geometry.overlap import bev_iou
 from asca_pillars.pictures.drawing import Image
 from asca_pillars.pictures.gallery_page import GalleryCard, gallery_page

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from asca_pillars.data.kitti import DEFAULT_IMAGE_SIZE_WH, Calibration, labels_text, objects_from_boxes
 from asca_pillars.detection.detections import Detections, FrameReport
+from asca_pillars.geometry.boxes import Ranges
 from asca_pillars.geometry.frame_change import FrameChange
-from asca_pillars.geometry.ranges import Ranges
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -8,8 +8,7 @@ from typing import Any
 from asca_deploy.bundle import MANIFEST, Bundle, weights_digest
 from asca_deploy.manifest import load_bundle, refuse_run_folder
 from asca_pillars.base.errors import BundleError
-from asca_pillars.base.files import WEIGHTS_FILE
-from asca_pillars.base.input_files import require_content
+from asca_pillars.base.files import WEIGHTS_FILE, require_content
 from asca_pillars.base.installation import find_shipped, shipped_models
 
 

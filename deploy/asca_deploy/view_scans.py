@@ -29,10 +29,9 @@ from asca_pillars.data.boxes.detector_scope import detector_scope
 from asca_pillars.detection.spec import ScoreThresholds
 from asca_pillars.pictures.colors import color_table, height_table
 from asca_pillars.scans.find_scans import name_scans
-from asca_pillars.scans.recordings.open_recording import is_recording
-from asca_pillars.scans.scan_input import ScanInput
+from asca_pillars.scans.recordings.recorded_scans import is_recording
 from asca_pillars.scans.scan_reader import Scan
-from asca_pillars.scans.scan_settings import ScanSettings
+from asca_pillars.scans.scan_settings import ScanInput, ScanSettings
 
 HOST = "127.0.0.1"
 LOWEST_SCORE = 0.1

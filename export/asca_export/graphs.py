@@ -19,8 +19,7 @@ from asca_deploy.bundle import Bundle
 from asca_deploy.graph import Tensor as Declared
 from asca_deploy.manifest import graph_files, graph_metadata
 from asca_deploy.pillar.graphs import PILLAR_FEATURES
-from asca_export.fast_forms import FastBackbone
-from asca_export.pillar.masked_forms import MaskedBackbone
+from asca_export.fast_forms import FastBackbone, MaskedBackbone
 from asca_pillars.config.pillar import TRACED_PILLARS
 from asca_pillars.detection.decode import HeadMaps
 from asca_pillars.ops.pillar.prepare import FEATURES

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from asca_deploy.bundle import Parity
 from asca_deploy.pillar.graphs import Maps
 from asca_deploy.pillar.pipeline import Canvas, PillarPipeline
-from asca_export.pillar.masked_forms import NEVER
+from asca_export.fast_forms import NEVER
 from asca_pillars.base.errors import ExportError
 from asca_pillars.detection.decode import HeadMaps
 from asca_pillars.detection.detections import Detections

@@ -7,7 +7,7 @@ from typing import Any, TextIO
 import pytest
 
 from asca_pillars.ablation import ablation_runs
-from asca_pillars.cli import ablate
+from asca_pillars.cli import ablate_steps
 from tests.helpers.in_process import run_here
 
 
@@ -23,4 +23,4 @@ def in_turn(monkeypatch: pytest.MonkeyPatch) -> None:
     # Training answers to Ctrl-C, which only a main thread can.
     monkeypatch.setattr(ablation_runs, "_run_in_threads", lambda todo, work, *_: [work(one) for one in todo])
     monkeypatch.setattr(ablation_runs, "subprocess", SimpleNamespace(run=run, STDOUT=subprocess.STDOUT))
-    monkeypatch.setattr(ablate, "TIMED_ROUNDS", 2)
+    monkeypatch.setattr(ablate_steps, "TIMED_ROUNDS", 2)

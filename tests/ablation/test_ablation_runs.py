@@ -12,13 +12,12 @@ import pytest
 import yaml
 
 from asca_pillars.ablation import ablation_runs
-from asca_pillars.ablation.ablation_runs import finish_runs, runs
-from asca_pillars.ablation.ablation_table import Speed, tables
+from asca_pillars.ablation.ablation_runs import Speed, finish_runs, runs, tables
 from asca_pillars.ablation.variants import PILLARS, VARIANTS
 from asca_pillars.base.errors import AscaError, TrainingError
 from asca_pillars.base.own_files import written_by
-from asca_pillars.base.schema import to_dict
-from asca_pillars.cli import ablate as ablate_command
+from asca_pillars.base.settings import to_dict
+from asca_pillars.cli import ablate_steps
 from asca_pillars.cli.ablate import ablate
 from asca_pillars.config.tree import load_config, pillar_spec
 from tests.helpers.scenes import write_dataset
@@ -48,7 +47,7 @@ def test_from_training_to_the_table(tmp_path: Path, config: str, monkeypatch: py
     assert (trained.train.learning_rate, pillar_spec(trained).grid.zones) == (2e-3, 1)
     weights = {run.checkpoint: run.checkpoint.stat().st_mtime_ns for run in runs(out, [0], list(VARIANTS.values())[:1])}
 
-    monkeypatch.setattr(ablate_command, "time_variants", lambda *_: {})  # which is all that is done again
+    monkeypatch.setattr(ablate_steps, "time_variants", lambda *_: {})  # which is all that is done again
     ablate(config, data=data, out=out, **options)  # nothing is trained twice
     assert all(path.stat().st_mtime_ns == before for path, before in weights.items())
     again = (out / "results.md").read_text()
@@ -161,17 +160,17 @@ def _accuracies(text: str) -> list[str]:
 
 def test_a_damaged_note_of_the_base_is_one_line_and_can_be_deleted(tmp_path: Path) -> None:
     base = {"config": {"name": "small"}, "data": "data/sim"}
-    ablate_command.require_same_base(tmp_path, base)
+    ablate_steps.require_same_base(tmp_path, base)
     (tmp_path / "none" / "seed0").mkdir(parents=True)
     (tmp_path / "none" / "seed0" / "train.log").write_text(written_by("asca ablate") + "\n")
     note = tmp_path / "ablation.json"
     note.write_text(note.read_text()[:-5])
     with pytest.raises(TrainingError, match=r"ablation\.json: not what `asca ablate` wrote, or damaged .*; delete it"):
-        ablate_command.require_same_base(tmp_path, base)
+        ablate_steps.require_same_base(tmp_path, base)
     note.unlink()
-    ablate_command.require_same_base(tmp_path, base)
+    ablate_steps.require_same_base(tmp_path, base)
     with pytest.raises(TrainingError, match="another base"):
-        ablate_command.require_same_base(tmp_path, base | {"data": "other"})
+        ablate_steps.require_same_base(tmp_path, base | {"data": "other"})
 
 
 def _result(car: float, pedestrian: float, cyclist: float | None) -> dict:

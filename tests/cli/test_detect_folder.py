@@ -14,8 +14,8 @@ pytest.importorskip("rosbags", reason="needs pip install -e '.[recordings]'")
 from asca_deploy import result_files
 from asca_deploy.detect_scans import detect_scans
 from asca_deploy.open_model import RuntimeOptions
-from asca_deploy.recordings import video as recording_video
-from asca_deploy.recordings.video import recording_rate_hz
+from asca_deploy.recordings import sequence_files as recording_video
+from asca_deploy.recordings.sequence_files import recording_rate_hz
 from asca_pillars.base.errors import AscaError, ConfigError, OutputError, ScanError
 from asca_pillars.cli.detect import detect
 from asca_pillars.pictures.video import BoxVideo, is_own_video

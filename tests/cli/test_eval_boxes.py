@@ -12,7 +12,7 @@ from asca_deploy import Detections, Detector, sample_scan_path
 from asca_pillars.base.errors import AscaError
 from asca_pillars.data.boxes.box_records import json_line, read_frames, records_from
 from asca_pillars.data.kitti import KittiSplit
-from asca_pillars.evaluation.model import Model
+from asca_pillars.evaluation.arguments import Model
 from asca_pillars.scans.mounting import Mounting
 from asca_pillars.scans.scan_reader import read_scan, write_scan
 from tests.data.boxes.box_scenes import write_box_dataset

@@ -10,10 +10,10 @@ import yaml
 from asca_deploy import detect_archive
 from asca_export.pv_rcnn import int8
 from asca_pillars.base.errors import ConfigError
-from asca_pillars.base.schema import to_dict
+from asca_pillars.base.settings import to_dict
 from asca_pillars.cli.detect import detect
 from asca_pillars.cli.inspect import inspect
-from asca_pillars.cli.prepare import prepare
+from asca_pillars.cli.train import prepare
 from asca_pillars.models.build import load_checkpoint
 from asca_pillars.scans.scan_reader import write_scan
 from asca_pillars.training.loop import train
@@ -75,7 +75,7 @@ def test_an_8_bit_bundle_from_export_to_evaluation(tmp_path: Path, monkeypatch: 
     monkeypatch.setattr(detect_archive, "require", lambda extra: None)
     detect([scans], out=tmp_path / "archive", bundle=bundle, cluster="made-up:1")
     assert read_lines(tmp_path / "out") == read_lines(tmp_path / "archive")
-    monkeypatch.setattr("asca_deploy.benchmark.roofline.gemm_rate", lambda kind, threads: 100.0)
+    monkeypatch.setattr("asca_deploy.benchmark.timing.gemm_rate", lambda kind, threads: 100.0)
     timed = run_here("bench", scans / "0.bin", "--bundle", bundle, "--rounds", 2, "--threads", 1)
     assert timed.returncode == 0 and "voxels" in timed.stdout, timed.stderr
     data = write_dataset(tmp_path / "data", 2)

@@ -10,11 +10,10 @@ from numpy.typing import NDArray
 from asca_deploy import Detector, sample_scan_path
 from asca_pillars.base.errors import AscaError, ConfigError, ScanError
 from asca_pillars.cli.options import read_scores, scan_settings
-from asca_pillars.evaluation.model import scores_by_class
+from asca_pillars.evaluation.arguments import scores_by_class
 from asca_pillars.scans.mounting import Mounting
-from asca_pillars.scans.scan_input import ScanInput
 from asca_pillars.scans.scan_reader import write_scan
-from asca_pillars.scans.scan_settings import ScanSettings, sample_points
+from asca_pillars.scans.scan_settings import ScanInput, ScanSettings, sample_points
 from tests.cli.short_drive import BUNDLE, SAMPLE, read_lines
 from tests.helpers.bundles import DENSE_INT8
 from tests.helpers.in_process import invoke, run_here

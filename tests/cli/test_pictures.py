@@ -9,10 +9,10 @@ import pytest
 import yaml
 
 from asca_pillars.base.errors import ConfigError, OutputError
-from asca_pillars.base.schema import to_dict
+from asca_pillars.base.settings import to_dict
 from asca_pillars.config.pillar import PillarModel
 from asca_pillars.config.tree import Config, DataConfig
-from asca_pillars.data.training_frames import open_frames
+from asca_pillars.data.augment import open_frames
 from asca_pillars.detection.anchors import ClassSpec
 from asca_pillars.pictures.training_pictures import draw_training_frame
 from asca_pillars.pictures.visualize import class_color, read_image

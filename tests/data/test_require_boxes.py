@@ -12,8 +12,8 @@ from asca_pillars.config.pillar import PillarModel
 from asca_pillars.config.tree import Config, DataConfig, InsertConfig
 from asca_pillars.data.insertion.insert_objects import prepare_inserter
 from asca_pillars.data.kitti import KittiSplit
-from asca_pillars.data.require_boxes import require_boxes
 from asca_pillars.scans.scan_reader import write_scan
+from asca_pillars.training.dataset import require_boxes
 from asca_pillars.training.loop import train
 from tests.helpers.scenes import SPEC, write_dataset
 

@@ -17,12 +17,10 @@ from asca_deploy.open_model import RuntimeOptions, files_need_around
 from asca_deploy.shipped import shipped_bundles
 from asca_pillars.base.errors import ConfigError
 from asca_pillars.detection.detections import Detections
-from asca_pillars.geometry.boxes import corners, wrap_angle
+from asca_pillars.geometry.boxes import Ranges, corners, wrap_angle
 from asca_pillars.geometry.frame_change import FrameChange
-from asca_pillars.geometry.ranges import Ranges
-from asca_pillars.scans.scan_input import ScanInput
 from asca_pillars.scans.scan_reader import read_scan
-from asca_pillars.scans.scan_settings import ScanSettings
+from asca_pillars.scans.scan_settings import ScanInput, ScanSettings
 
 Z_M = (-3.0, 1.0)
 KITTI = Ranges((0.0, 69.12), (-30.72, 30.72), Z_M)

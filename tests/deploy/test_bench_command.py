@@ -17,7 +17,7 @@ Points = NDArray[np.float32]
 
 @pytest.fixture(autouse=True)
 def _fast_machine(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("asca_deploy.benchmark.roofline.gemm_rate", lambda kind, threads: 100.0)
+    monkeypatch.setattr("asca_deploy.benchmark.timing.gemm_rate", lambda kind, threads: 100.0)
     monkeypatch.setenv("COLUMNS", "120")
 
 

@@ -23,10 +23,8 @@ from asca_deploy.benchmark import (
     measure_scaling,
     measure_throughput,
 )
-from asca_deploy.benchmark.roofline import SIZE, gemm_rate
 from asca_deploy.benchmark.speed_comparison import FRAMES_PER_TURN, box_difference
-from asca_deploy.benchmark.throughput import FRAMES, resample
-from asca_deploy.benchmark.timing import Percentiles
+from asca_deploy.benchmark.timing import FRAMES, SIZE, Percentiles, gemm_rate, resample
 from asca_deploy.manifest import load_pillar_bundle
 from asca_deploy.providers import PROVIDERS
 from asca_pillars.base.errors import AscaError
@@ -118,13 +116,13 @@ def test_the_product_of_matrices_runs_and_its_rate_is_counted_in_macs(
     kind: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     clock = iter(range(1000))
-    monkeypatch.setattr("asca_deploy.benchmark.roofline.perf_counter", lambda: next(clock))  # one second a product
+    monkeypatch.setattr("asca_deploy.benchmark.timing.perf_counter", lambda: next(clock))  # one second a product
     assert gemm_rate(kind, threads=1, rows=4) == pytest.approx(4 * SIZE * SIZE / 1e9)
 
 
 def test_roofline(tiny_bundle: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     rates = {"float32": 100.0, "int8": 400.0}
-    monkeypatch.setattr("asca_deploy.benchmark.roofline.gemm_rate", lambda kind, threads: rates[kind] * threads)
+    monkeypatch.setattr("asca_deploy.benchmark.timing.gemm_rate", lambda kind, threads: rates[kind] * threads)
     bundle = replace(load_pillar_bundle(tiny_bundle), backbone_gmac=5.0)
     found = measure_roofline(bundle, backbone_ms=50.0, threads=2)
     assert found.achieved_gmac_s == pytest.approx(100)

@@ -20,10 +20,9 @@ from asca_deploy.golden import write_golden
 from asca_deploy.manifest import load_pillar_bundle
 from asca_pillars.base.errors import AscaError, ScanError
 from asca_pillars.detection.detections import Detections
-from asca_pillars.geometry.boxes import wrap_angle
+from asca_pillars.geometry.boxes import Ranges, wrap_angle
 from asca_pillars.geometry.frame_change import FrameChange
 from asca_pillars.geometry.overlap import bev_iou
-from asca_pillars.geometry.ranges import Ranges
 from asca_pillars.pictures.colors import ground_height
 from asca_pillars.scans.ground_height import estimate_height, fit_ground_plane
 from asca_pillars.scans.mounting import Mounting

@@ -8,7 +8,7 @@ import pytest
 
 from asca_deploy.scan_detections import ScanDetections
 from asca_pillars.detection.detections import FrameReport, ScanCounts
-from asca_pillars.geometry.ranges import Ranges
+from asca_pillars.geometry.boxes import Ranges
 from tests.helpers.cameras import make_calibration
 from tests.helpers.sent import sent
 

@@ -11,8 +11,7 @@ import numpy as np
 
 from asca_deploy import Detections, Detector
 from asca_deploy.bundle import MANIFEST
-from asca_pillars.models.build import Checkpoint
-from asca_pillars.models.scan_detector import ScanDetector
+from asca_pillars.models.build import Checkpoint, ScanDetector
 from tests.export.tiny import SCANS
 
 

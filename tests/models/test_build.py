@@ -1,4 +1,7 @@
-"""The small form of a checkpoint, and what its weights are known by."""
+"""The small form of a checkpoint, and what its weights are known by.
+
+A checkpoint's network behind the interface of the runtime.
+"""
 
 import pickle
 from pathlib import Path
@@ -10,11 +13,16 @@ import torch
 from asca_pillars.base.errors import TrainingError
 from asca_pillars.config.pillar import NetworkConfig, PillarModel
 from asca_pillars.config.tree import Config
-from asca_pillars.models.build import Checkpoint, build_model, load_checkpoint
+from asca_pillars.detection.decode import HeadMaps
+from asca_pillars.models.build import Checkpoint, ScanDetector, build_model, load_checkpoint
 from asca_pillars.models.checkpoint_file import save_weights, weights_sha256
 from asca_pillars.models.openpcdet.import_checkpoint import read_foreign
-from asca_pillars.training.checkpoints import LAST, checkpoint_to_resume
+from asca_pillars.models.pillar.network import build_pillar_detector
+from asca_pillars.models.pillar.preparation import batch_pillars
+from asca_pillars.training.callbacks import LAST, checkpoint_to_resume
 from tests.helpers.saved_checkpoint import checkpoint_content
+from tests.helpers.scenes import make_scene
+from tests.helpers.tiny_run import CONFIG
 
 NARROW = Config(model=PillarModel(network=NetworkConfig(block_channels=(4, 4, 4), upsample_channels=4)))
 
@@ -83,3 +91,22 @@ def test_weights_are_known_by_names_shapes_and_values() -> None:
         {"a": weights["a"]},
     )
     assert len({known, *map(weights_sha256, others)}) == 5
+
+
+def test_scans_one_by_one_are_what_a_batch_of_them_gives() -> None:
+    """And the second scan does not inherit the first."""
+    torch.manual_seed(3)
+    assert isinstance(CONFIG.model, PillarModel)
+    network = build_pillar_detector(CONFIG.model).eval()
+    spec = CONFIG.model.spec.with_score_threshold(0.001)
+    detect = ScanDetector(network, spec)
+    scans = [make_scene(seed)[0] for seed in (1, 2)]
+    with torch.inference_mode():
+        maps = network(batch_pillars([spec.pillarize(points) for points in scans]))
+    for index in (0, 1, 0):
+        expected = spec.decode(HeadMaps(*(part[index].numpy() for part in maps)))
+        found = detect(scans[index])
+        assert len(found) == len(expected) > 0 and found.names == expected.names
+        np.testing.assert_allclose(found.boxes, expected.boxes, atol=1e-4)
+        np.testing.assert_allclose(found.scores, expected.scores, atol=1e-5)
+    assert len(ScanDetector(network, CONFIG.model.spec)(np.empty((0, 4), np.float32))) == 0

@@ -11,8 +11,7 @@ import torch
 from asca_pillars.config.pillar import PillarModel
 from asca_pillars.config.tree import Config
 from asca_pillars.detection.spec import DetectorSpec
-from asca_pillars.models.build import build_model
-from asca_pillars.models.scan_detector import ScanDetector
+from asca_pillars.models.build import ScanDetector, build_model
 from asca_pillars.models.trainable import Trainable, to_device
 from asca_pillars.training.dataset import Batch, Collate, open_dataset
 from tests.helpers.scenes import SPEC, write_dataset

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from asca_pillars.geometry.ranges import Ranges
+from asca_pillars.geometry.boxes import Ranges
 from asca_pillars.pictures.drawing import BoxLayer, Trail
 from asca_pillars.pictures.perspective import ChaseCamera, draw_chase
 from asca_pillars.pictures.visualize import class_color

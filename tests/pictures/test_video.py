@@ -10,8 +10,8 @@ import pytest
 
 from asca_pillars.base.errors import AscaError, ConfigError
 from asca_pillars.detection.detections import Detections
+from asca_pillars.geometry.boxes import Ranges
 from asca_pillars.geometry.frame_change import FrameChange
-from asca_pillars.geometry.ranges import Ranges
 from asca_pillars.pictures import video
 from asca_pillars.pictures.video import BoxVideo, VideoFile, is_own_video
 from asca_pillars.pictures.visualize import class_color

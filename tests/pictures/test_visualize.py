@@ -6,7 +6,7 @@ import pytest
 
 from asca_pillars.data.kitti.calibration import Calibration
 from asca_pillars.detection.detections import Detections
-from asca_pillars.geometry.ranges import Ranges
+from asca_pillars.geometry.boxes import Ranges
 from asca_pillars.pictures.colors import HEIGHT_RAMP
 from asca_pillars.pictures.drawing import BoxLayer
 from asca_pillars.pictures.visualize import class_color, draw_bev, draw_layers, draw_on_image, write_png

@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from asca_deploy import sample_scan_path
 from asca_pillars.base.errors import ConfigError
+from asca_pillars.geometry.boxes import Ranges
 from asca_pillars.geometry.frame_change import FrameChange
-from asca_pillars.geometry.ranges import Ranges
 from asca_pillars.ops.pillar.grid import PillarGrid
 from asca_pillars.ops.pillar.prepare import PillarLimits, pillarize
 from asca_pillars.scans.input_check import (

@@ -16,8 +16,8 @@ from asca_pillars.scans import scan_reader
 from asca_pillars.scans.find_scans import SCAN_SUFFIXES
 from asca_pillars.scans.ply import MAX_LISTS
 from asca_pillars.scans.records import points_from_array
-from asca_pillars.scans.scan_input import folder_reflectance_scale
 from asca_pillars.scans.scan_reader import decide_scale, read_scan, write_scan
+from asca_pillars.scans.scan_settings import folder_reflectance_scale
 from tests.scans.scan_files import POINTS, npy, pcd, ply, read
 
 FILES = {

@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
 from asca_pillars.base.errors import ScanError
-from asca_pillars.scans.recordings.open_recording import open_recording
-from asca_pillars.scans.recordings.recorded_scans import RecordedScans
+from asca_pillars.scans.recordings.recorded_scans import RecordedScans, open_recording
 from asca_pillars.scans.recordings.recording import Message, Recording, Topic
 from asca_pillars.scans.transforms import TRANSFORM_TYPES, Poses, Transforms, read_poses, read_static_transforms
 from tests.scans.recordings.cloud_recordings import (

@@ -1,4 +1,7 @@
-"""Whole frames: reproducible, readable, labelled as KITTI would."""
+"""Whole frames: reproducible, readable, labelled as KITTI would.
+
+How a simulation is divided.
+"""
 
 import json
 from pathlib import Path
@@ -13,7 +16,7 @@ from asca_pillars.data.kitti import KittiSplit, boxes_from_objects, in_image, ob
 from asca_pillars.geometry.boxes import points_in_boxes
 from asca_pillars.geometry.overlap import bev_intersection
 from asca_pillars.sim.scene_config import SceneConfig
-from asca_pillars.sim.simulation import Frame, SimulationConfig, simulate, simulate_frame
+from asca_pillars.sim.simulation import Frame, SimulationConfig, held_out, simulate, simulate_frame
 from asca_pillars.sim.world.scene import draw_scene
 from tests.helpers.sent import sent
 
@@ -284,3 +287,8 @@ def test_a_set_labelled_all_around_says_so_and_reads_back_for_training(tmp_path:
     assert ahead > 0 and behind > 0
     with pytest.raises(DatasetError, match="another folder"):
         simulate(tmp_path, 3)
+
+
+def test_both_lists_get_a_frame_where_there_are_two() -> None:
+    assert [held_out(count, 0.1) for count in (1, 2, 5, 14, 100)] == [0, 1, 1, 1, 10]
+    assert [held_out(3, share) for share in (0.0, 0.9, 1.0)] == [0, 2, 3]

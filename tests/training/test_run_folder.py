@@ -11,13 +11,14 @@ import yaml
 
 from asca_pillars.base.errors import ConfigError, DatasetError, OutputError, TrainingError
 from asca_pillars.base.locks import only_writer
-from asca_pillars.base.schema import to_dict
+from asca_pillars.base.settings import to_dict
 from asca_pillars.base.system import describe_environment
 from asca_pillars.config.tree import Config, DataConfig, TrainConfig
 from asca_pillars.data.kitti import KittiSplit
 from asca_pillars.training import loop
 from asca_pillars.training.loop import train
-from asca_pillars.training.run_folder import YAML_HEAD, TrainingInputs, claim_run_folder, measure_input, require_own_run
+from asca_pillars.training.run_files import YAML_HEAD, require_own_run
+from asca_pillars.training.run_folder import TrainingInputs, claim_run_folder, measure_input
 from tests.helpers.in_process import run_here
 from tests.helpers.scenes import write_dataset
 from tests.helpers.tiny_run import CONFIG, with_train

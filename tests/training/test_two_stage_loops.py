@@ -16,8 +16,7 @@ from asca_pillars.data.augment import move_scene
 from asca_pillars.data.frames import LabeledFrame, Motion
 from asca_pillars.data.kitti import KittiSplit
 from asca_pillars.geometry.boxes import wrap_angle
-from asca_pillars.models.build import build_model, load_checkpoint
-from asca_pillars.models.scan_detector import ScanDetector
+from asca_pillars.models.build import ScanDetector, build_model, load_checkpoint
 from asca_pillars.models.two_stage.first_stage import open_first_stage, with_first_stage
 from asca_pillars.models.two_stage.network import RefineDetector, refine
 from asca_pillars.models.two_stage.preparation import LabeledProposals, move_proposed

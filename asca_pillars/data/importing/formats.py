@@ -92,7 +92,7 @@ def _tool(module: str, name: str, help_text: str) -> LabelFormat:
 FORMATS: Mapping[str, LabelFormat] = {
     "boxes": LabelFormat(
         help=".csv or .jsonl for all scans, or a folder with a .csv or .json for each (docs/DATA.md)",
-        reads="box_files:read_box_files",
+        reads="tool_labels:read_box_files",
         scans_elsewhere=True,
     ),
     "labelcloud": _tool("labelcloud", "labelcloud", "labelCloud's labels/ (centroid_abs or centroid_rel)"),

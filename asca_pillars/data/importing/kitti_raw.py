@@ -14,7 +14,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from asca_pillars.base.errors import DatasetError
-from asca_pillars.base.input_files import read_text
+from asca_pillars.base.files import read_text
 from asca_pillars.base.progress import SILENT, Reporter
 from asca_pillars.data.boxes.box_records import records_from
 from asca_pillars.data.boxes.box_split import BoxDataset

@@ -10,7 +10,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 from asca_pillars.base.errors import DatasetError
-from asca_pillars.base.input_files import read_text
+from asca_pillars.base.files import read_text
 from asca_pillars.data.importing.imported import Imported, entry
 from asca_pillars.data.importing.tool_labels import (
     COLORS,

@@ -17,8 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_pillars.base.errors import DatasetError
-from asca_pillars.base.files import file_inside
-from asca_pillars.base.input_files import read_text
+from asca_pillars.base.files import file_inside, read_text
 from asca_pillars.base.progress import SILENT, Reporter
 from asca_pillars.data.boxes.box_records import BoxRecords, records_from
 from asca_pillars.data.boxes.box_split import BoxDataset

@@ -21,8 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_pillars.base.errors import AscaError, DatasetError
-from asca_pillars.base.files import atomic_path, portable_name, write_text
-from asca_pillars.base.input_files import require_content
+from asca_pillars.base.files import atomic_path, portable_name, require_content, write_text
 from asca_pillars.base.installation import install_command
 from asca_pillars.base.progress import SILENT, Reporter
 from asca_pillars.data.boxes.box_records import BoxRecords, records_from

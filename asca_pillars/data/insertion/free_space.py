@@ -30,7 +30,7 @@ from asca_pillars.data.insertion.ground_fit import (
 from asca_pillars.data.insertion.prepared import require_writable, writable_atomic_path
 from asca_pillars.geometry.arrays import Floating, Floats, Ints, Mask, Singles
 from asca_pillars.geometry.boxes import footprints
-from asca_pillars.geometry.common_plane import plane_heights
+from asca_pillars.scans.ground_height import plane_heights
 
 CELL_M = 0.25
 OBSTACLE_M = (0.25, 2.5)  # heights above the ground of obstacles to a person or a car

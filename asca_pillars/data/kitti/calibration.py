@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_pillars.base.errors import DatasetError
-from asca_pillars.base.files import atomic_path
-from asca_pillars.base.input_files import read_text
+from asca_pillars.base.files import atomic_path, read_text
 from asca_pillars.geometry.boxes import corners
 from asca_pillars.geometry.frame_change import transform_columns
 

@@ -19,16 +19,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_pillars.base.errors import DatasetError, OutputError
-from asca_pillars.base.files import atomic_path
-from asca_pillars.base.input_files import read_text, require_content
+from asca_pillars.base.files import atomic_path, read_text, require_content
 from asca_pillars.data.frames import LabeledBoxes
 from asca_pillars.data.kitti.calibration import DEFAULT_IMAGE_SIZE_WH, Calibration, in_image, read_calibration
 from asca_pillars.data.kitti.kitti_labels import KittiObject, boxes_from_objects, objects_3d, read_labels
 from asca_pillars.geometry.frame_change import FrameChange
 from asca_pillars.scans.find_scans import visible_files
 from asca_pillars.scans.mounting import Mounting
-from asca_pillars.scans.scan_input import stored_points
 from asca_pillars.scans.scan_reader import read_scan
+from asca_pillars.scans.scan_settings import stored_points
 
 SIMULATION_FILE = "simulation.json"
 """File in the dataset's folder with the settings of `asca simulate`."""

@@ -16,15 +16,17 @@ from asca_pillars.evaluation.errors.box_errors import (
     CORRECTIONS,
     FALSE_KINDS,
     RESIDUALS,
+    TRAITS,
     DetectionMatch,
     ObjectMatch,
+    Surroundings,
     box_residuals,
     boxes_from_residuals,
     corrected,
+    describe,
     match_frame,
 )
 from asca_pillars.evaluation.errors.error_frames import UNKNOWN_OCCLUSION, ErrorFrame, ErrorFrames
-from asca_pillars.evaluation.errors.false_detections import TRAITS, Surroundings, describe
 from asca_pillars.evaluation.errors.label_fit import END_ON_DEG, STATISTICS, label_fit
 from asca_pillars.evaluation.kitti.average_precision import CLASS_NAMES, min_overlap
 from asca_pillars.geometry.overlap import paired_iou_3d

@@ -10,10 +10,16 @@ from numpy.typing import NDArray
 
 from asca_pillars.base.progress import SILENT, Reporter
 from asca_pillars.data.insertion.ground_fit import Ground, fit_ground
-from asca_pillars.evaluation.errors.box_errors import RESIDUALS, DetectionMatch, ObjectMatch, box_residuals
+from asca_pillars.evaluation.errors.box_errors import (
+    BRIGHT_REFLECTANCE,
+    RESIDUALS,
+    DetectionMatch,
+    ObjectMatch,
+    Surroundings,
+    box_residuals,
+)
 from asca_pillars.evaluation.errors.error_frames import ErrorFrames
 from asca_pillars.evaluation.errors.error_summary import BLOCK_FRAMES, Matches, view_of
-from asca_pillars.evaluation.errors.false_detections import BRIGHT_REFLECTANCE, Surroundings
 from asca_pillars.geometry.boxes import footprints
 
 MAX_POINTS = 1200  # of a pane; more are subsampled

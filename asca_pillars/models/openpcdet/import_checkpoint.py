@@ -9,17 +9,22 @@ import torch
 from torch import Tensor
 
 from asca_pillars.base.errors import ConfigError, TrainingError
-from asca_pillars.base.input_files import require_content
-from asca_pillars.base.schema import to_dict
+from asca_pillars.base.files import require_content
+from asca_pillars.base.settings import to_dict
 from asca_pillars.config.pillar import PillarModel
 from asca_pillars.config.pv_rcnn import PvRcnnModel
 from asca_pillars.config.tree import Config
 from asca_pillars.models.build import build_model
 from asca_pillars.models.checkpoint_file import read_failure, read_plain, write_plain
 from asca_pillars.models.openpcdet.key_mapping import KeyMapping, convert_state
-from asca_pillars.models.openpcdet.mmdetection3d_keys import FIRST_LINEAR, FUSION, mmdetection3d_keys
-from asca_pillars.models.openpcdet.pointpillars_keys import pointpillars_keys
-from asca_pillars.models.openpcdet.pv_rcnn_keys import FIRST_CONVOLUTION, pv_rcnn_keys
+from asca_pillars.models.openpcdet.pv_rcnn_keys import (
+    FIRST_CONVOLUTION,
+    FIRST_LINEAR,
+    FUSION,
+    mmdetection3d_keys,
+    pointpillars_keys,
+    pv_rcnn_keys,
+)
 
 CONFIG_OF = {
     "vfe.pfn_layers.0.linear.weight": "openpcdet_pointpillars_kitti",

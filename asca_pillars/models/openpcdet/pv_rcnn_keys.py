@@ -3,13 +3,29 @@
 Theirs joins a keypoint's features as map, raw points, conv1 to conv4, ours as `settings.sources` and the map; a channel
 of their map is channel * height + z, of ours z * channels + channel; their pooled grid is channel-major, ours has the
 channels of a grid point side by side.
+
+The PointPillars of OpenPCDet, and the first layer of mmdetection3d's, as ours.
+
+Their points have a tenth feature, the height above the pillar's center. All pillars have the same center height, so the
+feature is z less a constant: its weight joins that of z, and the constant joins the mean of the normalization. An empty
+slot has zeros in all ten, the height of the center included, and so it keeps its own value before the normalization.
+
+In mmdetection3d (`legacy`) the offsets to the pillar's center also take the place of x, y and z: their weights join.
+
+mmdetection3d's PointPillars and PV-RCNN as ours: the networks of OpenPCDet under other names.
+
+Their convolutions of a second stage and of set abstraction are modules with a `conv` and a `bn`, where OpenPCDet counts
+layers; the layouts of the arrays are the same.
 """
 
+import re
 from collections.abc import Callable, Iterator, Mapping
 
 import torch
 from torch import Tensor
 
+from asca_pillars.base.errors import TrainingError
+from asca_pillars.config.pillar import PillarModel
 from asca_pillars.config.pv_rcnn import PvRcnnModel
 from asca_pillars.models.openpcdet.key_mapping import (
     KeyMapping,
@@ -18,7 +34,71 @@ from asca_pillars.models.openpcdet.key_mapping import (
     norm_keys,
     squeeze_kernel,
 )
+from asca_pillars.ops.pillar.prepare import FEATURES
 from asca_pillars.ops.pv_rcnn.prepare import LEVEL_SOURCES
+
+_Z = FEATURES.index("z")
+_X_CENTER, _Z_CENTER = FEATURES.index("x_center"), len(FEATURES)  # the last is the one feature that ours does not have
+
+
+def pointpillars_keys(model: PillarModel, state: Mapping[str, Tensor]) -> Iterator[KeyMapping]:
+    """Yield the mappings for `build_pillar_detector(model)` from `state`, OpenPCDet's unitless weights (out, in, ...).
+
+    Raises:
+        TrainingError: points with other features.
+    """
+    yield from encoder_keys(model, state, "vfe.pfn_layers.0")
+    yield from map_backbone_keys(model.network.block_convs)
+
+
+def encoder_keys(
+    model: PillarModel, state: Mapping[str, Tensor], layer: str, *, legacy: bool = False
+) -> Iterator[KeyMapping]:
+    """Yield the key mappings of the layer on points.
+
+    Args:
+        model: ours.
+        state: their unitless weights (out, in, ...) by name.
+        layer: their name of it.
+        legacy: whether the offsets to the pillar's center also stand in the place of x, y and z.
+
+    Raises:
+        TrainingError: points with other features.
+    """
+    name = f"{layer}.linear.weight"
+    low_m, high_m = model.spec.grid.z_range_m
+    shape = tuple(state[name].shape) if name in state else None
+    if shape is not None and (len(shape) != 2 or shape[1] != _Z_CENTER + 1):
+        raise TrainingError(
+            f"{name} has shape {shape}: its points must have {_Z_CENTER + 1} features, x, y, z, intensity and six "
+            "offsets; others cannot be imported"
+        )
+
+    def explicit(weight: Tensor) -> Tensor:
+        """Return their weight (out, 10) of x, y, z themselves and of their offsets, each once."""
+        weight = weight.clone()
+        if legacy:
+            weight[:, _X_CENTER:] += weight[:, : _Z + 1]
+            weight[:, : _Z + 1] = 0
+        return weight
+
+    def of_height(weight: Tensor) -> Tensor:
+        return explicit(weight)[:, _Z_CENTER] * ((low_m + high_m) / 2)
+
+    def linear(weight: Tensor) -> Tensor:
+        merged = explicit(weight)
+        merged[:, _Z] += merged[:, _Z_CENTER]
+        return merged[:, :_Z_CENTER]
+
+    yield KeyMapping(name, "encode.linear.weight", linear)
+    for mapping in norm_keys(f"{layer}.norm", "encode.norm"):
+        if mapping.target.endswith("running_mean"):
+            yield mapping._replace(convert=lambda mean: mean + of_height(state[name]))
+        else:
+            yield mapping
+    if model.network.empty_slots:
+        yield KeyMapping(name, "encode.empty_slot", of_height)
+
 
 FIRST_CONVOLUTION = "backbone_3d.conv_input.0.weight"
 _JOINED = ("points", *LEVEL_SOURCES)  # after the map
@@ -130,3 +210,91 @@ def _channels_of(order: Tensor) -> Callable[[Tensor], Tensor]:
         return weight[:, order] if weight.shape[1] == len(order) else weight
 
     return convert
+
+
+_ENCODER, _VOXELS = "voxel_encoder.pfn_layers.0", "middle_encoder"
+FIRST_LINEAR = f"{_ENCODER}.linear.weight"
+FUSION = "points_encoder.point_feature_fusion_layer.0.conv.weight"
+_OLD_FEATURES = 9  # features of a point before 1.0, whose boxes had other axes too
+
+
+def _part(layer: str, layers: int) -> str:
+    """Return `conv` or `bn` for OpenPCDet's layer number, where each module counts `layers` layers."""
+    return ("conv", "bn")[int(layer) % layers]
+
+
+_Name = Callable[[re.Match[str]], str]
+_POOLS = {
+    "pfe.SA_rawpoints": "points_encoder.rawpoints_sa_layer",
+    "pfe.SA_layers": "points_encoder.voxel_sa_layers",
+    "roi_head.roi_grid_pool_layer": "roi_head.bbox_roi_extractor.roi_grid_pool_layer",
+}
+_LAYERS = {"0": "0.conv", "1": "0.bn", "4": "2.conv", "5": "2.bn", "7": "3"}
+"""Names of the fully connected layers: OpenPCDet has dropout at 3, mmdetection3d at 1."""
+_NAMES: tuple[tuple[str, _Name], ...] = (
+    (r"backbone_2d\.blocks\.(\d+)\.(\d+)", lambda m: f"backbone.blocks.{m[1]}.{int(m[2]) - 1}"),  # without the padding
+    (r"backbone_2d\.deblocks", lambda _: "neck.deblocks"),
+    (r"backbone_3d\.conv(\d)", lambda m: f"{_VOXELS}.encoder_layers.encoder_layer{m[1]}"),
+    (r"backbone_3d", lambda _: _VOXELS),
+    (
+        r"(pfe\.SA_rawpoints|pfe\.SA_layers|roi_head\.roi_grid_pool_layer)(\.\d+)?\.mlps\.(\d+)\.(\d+)",
+        lambda m: f"{_POOLS[m[1]]}{m[2] or ''}.mlps.{m[3]}.layer{int(m[4]) // 3}.{_part(m[4], 3)}",
+    ),
+    (
+        r"pfe\.vsa_point_feature_fusion\.(\d)",
+        lambda m: f"points_encoder.point_feature_fusion_layer.0.{_part(m[1], 2)}",
+    ),
+    (r"point_head\.cls_layers", lambda _: "roi_head.semantic_head.seg_cls_layer"),
+    (r"roi_head\.(shared_fc|cls|reg)_layers?\.(\d)", lambda m: f"roi_head.bbox_head.{m[1]}_layer.{_LAYERS[m[2]]}"),
+    (r"dense_head\.conv_box", lambda _: "dense_head.conv_reg"),
+)
+"""Prefixes of OpenPCDet's names, and their replacements."""
+
+
+def mmdetection3d_keys(
+    model: PillarModel | PvRcnnModel,
+    state: Mapping[str, Tensor],
+    our_state: Mapping[str, Tensor],
+    *,
+    legacy: bool = True,
+) -> Iterator[KeyMapping]:
+    """Yield the key mappings for our network of this model.
+
+    Args:
+        model: ours.
+        state: their unitless weights (out, in, ...) by name.
+        our_state: ours, likewise.
+        legacy: their encoder's flag of that name, see `encoder_keys`; true unless a configuration says otherwise.
+
+    Raises:
+        TrainingError: points with other features.
+    """
+    if isinstance(model, PillarModel):
+        _refuse_old_axes(state)
+        yield from encoder_keys(model, state, _ENCODER, legacy=legacy)
+        yield from (_renamed(mapping, "bbox_head") for mapping in map_backbone_keys(model.network.block_convs))
+        return
+    levels, voxels = (f"{_VOXELS}.encoder_layers.encoder_layer", "backbone_3d.conv"), (_VOXELS, "backbone_3d")
+    renamed = {name.replace(*levels).replace(*voxels): array for name, array in state.items()}
+    yield from (_renamed(mapping, "rpn_head") for mapping in pv_rcnn_keys(model, renamed, our_state))
+
+
+def mmdetection3d_name(name: str, head: str = "rpn_head") -> str:
+    """Return mmdetection3d's name of an array of OpenPCDet's; `head` is that of its head on anchors."""
+    for pattern, other in _NAMES:
+        if match := re.match(pattern + r"(?=\.)", name):
+            name = other(match) + name[match.end() :]
+            break
+    return re.sub(r"^dense_head", head, name)
+
+
+def _renamed(mapping: KeyMapping, head: str) -> KeyMapping:
+    return mapping._replace(source=mmdetection3d_name(mapping.source, head))
+
+
+def _refuse_old_axes(state: Mapping[str, Tensor]) -> None:
+    if FIRST_LINEAR in state and state[FIRST_LINEAR].shape[1:] == (_OLD_FEATURES,):
+        raise TrainingError(
+            f"{FIRST_LINEAR} has {_OLD_FEATURES} features of a point: trained by mmdetection3d before 1.0, whose boxes "
+            "have other axes; give a checkpoint of 1.0 or later"
+        )

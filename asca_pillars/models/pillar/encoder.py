@@ -13,8 +13,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812  (torch's own convention)
 
 from asca_pillars.config.pillar import CpaReading
-from asca_pillars.models.map_backbone import NORM_EPS, NORM_MOMENTUM
-from asca_pillars.models.sparse_conv import linear_rows
+from asca_pillars.models.map_backbone import NORM_EPS, NORM_MOMENTUM, linear_rows
 from asca_pillars.ops.pillar.prepare import FEATURES, PillarLimits
 
 

@@ -8,8 +8,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812  (torch's own convention)
 
-from asca_pillars.models.map_backbone import MapBackbone
-from asca_pillars.models.sparse_conv import at_active_cells, linear_rows, rulebook_conv
+from asca_pillars.models.map_backbone import MapBackbone, at_active_cells, linear_rows, rulebook_conv
 from asca_pillars.ops.pillar.grid import HEAD_STRIDE, NECK_STRIDE
 from asca_pillars.ops.pillar.neck_rulebooks import MaskRule, NeckRulebooks
 

@@ -18,9 +18,9 @@ from asca_pillars.models.map_backbone import (
     MapBackbone,
     SSDHead,
     as_map,
+    rulebook_conv,
 )
 from asca_pillars.models.pv_rcnn.preparation import VoxelBatch, deformed_balls
-from asca_pillars.models.sparse_conv import rulebook_conv
 from asca_pillars.models.two_stage.layers import (
     BallSource,
     KeypointEncoder,

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from asca_pillars.base.errors import ConfigError
 from asca_pillars.base.strict import Strict
-from asca_pillars.geometry.ranges import Ranges
+from asca_pillars.geometry.boxes import Ranges
 
 __all__ = ["HEAD_STRIDE", "NECK_STRIDE", "PillarGrid"]
 

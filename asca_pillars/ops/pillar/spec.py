@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_pillars.detection.spec import DetectorSpec
-from asca_pillars.geometry.ranges import Ranges
+from asca_pillars.geometry.boxes import Ranges
 from asca_pillars.ops.pillar.grid import PillarGrid
 from asca_pillars.ops.pillar.prepare import PillarLimits, Pillars, pillarize
 

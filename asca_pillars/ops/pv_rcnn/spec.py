@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from asca_pillars.base.errors import ConfigError
 from asca_pillars.detection.spec import DetectorSpec
-from asca_pillars.geometry.ranges import Ranges
+from asca_pillars.geometry.boxes import Ranges
 from asca_pillars.ops.pv_rcnn.rulebooks import PV_RCNN_STRIDED, VoxelRulebookBuilder
 from asca_pillars.ops.pv_rcnn.voxels import VoxelGrid
 from asca_pillars.ops.sparse.rulebooks import Convolution, Shape

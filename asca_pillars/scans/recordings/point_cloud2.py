@@ -1,21 +1,222 @@
-"""ROS' sensor_msgs/PointCloud2: points of any field layout, byte order and padding."""
+"""ROS' sensor_msgs/PointCloud2: points of any field layout, byte order and padding.
 
+Messages of other types: sensor_msgs/PointCloud, Livox' CustomMsg, foxglove.PointCloud and CompressedImage.
+
+The layouts are those of their public definitions (common_interfaces, livox_ros_driver2, foxglove/schemas).
+"""
+
+import base64
+import binascii
+import json
+import struct
+from collections.abc import Iterator
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from asca_pillars.base.errors import ScanError
-from asca_pillars.scans.recordings.messages import decode_message, time_of
-from asca_pillars.scans.recordings.other_clouds import (
-    apply_pose,
-    foxglove_cloud,
-    livox_cloud,
-    packed_points,
-    point_cloud,
-)
+from asca_pillars.geometry.frame_change import rotations_from_quaternions, transform_points
+from asca_pillars.scans.recordings.messages import decode_message, decompress_message, time_of
 from asca_pillars.scans.recordings.packet_files import velodyne_scan
 from asca_pillars.scans.recordings.recording import Message, ScanKind, reason
 from asca_pillars.scans.records import MAX_POINTS, Field, StoredPoints, assemble_points, select_fields
+
+# foxglove.NumericType to the datatypes of sensor_msgs/PointField
+_NUMERIC = {1: 2, 2: 1, 3: 4, 4: 3, 5: 6, 6: 5, 7: 7, 8: 8}
+_FLOAT, _BYTE = np.dtype("<f4"), np.dtype("u1")
+_LIVOX = ("offset_time", "x", "y", "z", "reflectivity", "tag", "line")
+_REFLECTANCE = ("intensity", "intensities", "reflectance", "reflectivity", "i")
+
+
+def point_cloud(message: Message) -> tuple[Any, StoredPoints]:
+    """Return header and points of a stored sensor_msgs/PointCloud.
+
+    Raises:
+        Exception: it is damaged.
+    """
+    cloud = decode_message(message, "sensor_msgs/msg/PointCloud")
+    xyz = np.array([(point.x, point.y, point.z) for point in cloud.points], np.float32).reshape(-1, 3)
+    channel = next((one for name in _REFLECTANCE for one in cloud.channels if one.name.lower() == name), None)
+    if channel is None:
+        return cloud.header, StoredPoints(xyz, None, None)
+    if len(channel.values) != len(xyz):
+        raise ValueError(f"{len(channel.values)} values of {channel.name[:40]} for {len(xyz)} points")
+    return cloud.header, StoredPoints(xyz, np.asarray(channel.values), _FLOAT)
+
+
+def livox_cloud(message: Message) -> tuple[Any, StoredPoints]:
+    """Return header and points of a stored livox_ros_driver/CustomMsg; reflectivities are 0..255.
+
+    Raises:
+        Exception: it is damaged.
+    """
+    data = decompress_message(message)
+    if message.encoding == "ros1":
+        _, sec, nanosec, length = struct.unpack_from("<IIII", data)
+        name, start, stride = 16, 16 + length + 8 + 4 + 4, 19
+        (count,) = struct.unpack_from("<I", data, start)
+    else:
+        order = "<" if data[1] & 1 else ">"
+        if order == ">":
+            raise ValueError("its numbers are big-endian")
+        sec, nanosec, length = struct.unpack_from("<iII", data, 4)
+        name, stride = 16, 20
+        start = 4 + -(-(name + length - 4) // 8) * 8 + 8 + 4 + 4  # uint64 is aligned, 4 bytes of CDR first
+        (count,) = struct.unpack_from("<I", data, start)
+    first = start + 4
+    if count > MAX_POINTS or (count and len(data) < first + (count - 1) * stride + 19):
+        raise ValueError(f"{len(data)} bytes where {count} points need more")
+    places = dict(zip(_LIVOX, (0, 4, 8, 12, 16, 17, 18), strict=True))
+    columns = [
+        np.ndarray((count,), _BYTE if key == "reflectivity" else _FLOAT, data, first + places[key], (stride,))
+        for key in ("x", "y", "z", "reflectivity")
+    ] if count else [np.zeros(0, _FLOAT)] * 3 + [np.zeros(0, _BYTE)]  # fmt: skip
+    frame_id = data[name : name + length].rstrip(b"\0").decode(errors="replace")
+    fields = [Field("x", _FLOAT), Field("y", _FLOAT), Field("z", _FLOAT), Field("reflectivity", _BYTE)]
+    header = SimpleNamespace(stamp=SimpleNamespace(sec=sec, nanosec=nanosec), frame_id=frame_id)
+    return header, assemble_points(count, columns, fields)
+
+
+def packed_points(message: Message) -> tuple[Any, StoredPoints]:
+    """Return header and points of a revolution, in the message format of `packet_files`."""
+    table = np.frombuffer(message.data, _FLOAT).reshape(-1, 4)
+    header = SimpleNamespace(stamp=SimpleNamespace(sec=0, nanosec=0), frame_id="")
+    return header, StoredPoints(table[:, :3], table[:, 3], _FLOAT)
+
+
+def foxglove_cloud(message: Message) -> Any:
+    """Decode a foxglove.PointCloud, JSON or Protobuf, as an object with the fields of PointCloud2, and a `pose`.
+
+    Raises:
+        Exception: it is damaged.
+    """
+    content = _of_json(message.data) if message.encoding == "json" else _of_protobuf(message.data)
+    stride, data = int(content["point_stride"]), content["data"]
+    fields = [
+        SimpleNamespace(
+            name=one["name"], offset=int(one.get("offset", 0)), datatype=_NUMERIC[int(one["type"])], count=1
+        )
+        for one in content["fields"]
+    ]
+    count = len(data) // stride if stride else 0
+    sec, nanosec = content["time"]
+    header = SimpleNamespace(stamp=SimpleNamespace(sec=sec, nanosec=nanosec), frame_id=content["frame_id"])
+    return SimpleNamespace(
+        header=header, height=1, width=count, point_step=stride, row_step=count * stride, is_bigendian=False,
+        fields=fields, data=np.frombuffer(data, np.uint8)[: count * stride], pose=content["pose"],
+    )  # fmt: skip
+
+
+def foxglove_image(message: Message) -> Any:
+    """Decode a foxglove.CompressedImage, JSON or Protobuf, as an object like sensor_msgs/CompressedImage.
+
+    Raises:
+        Exception: it is damaged.
+    """
+    if message.encoding == "json":
+        content = json.loads(message.data)
+        time, data = content.get("timestamp") or {}, base64.b64decode(content["data"], validate=True)
+        sec, nanosec, format_ = int(time.get("sec", 0)), int(time.get("nsec", 0)), str(content.get("format", ""))
+    else:
+        fields = dict(_wire(message.data))
+        stamp, data = dict(_wire(fields.get(1, b""))), fields.get(2, b"")
+        sec, nanosec, format_ = stamp.get(1, 0), stamp.get(2, 0), fields.get(3, b"").decode(errors="replace")
+    header = SimpleNamespace(stamp=SimpleNamespace(sec=sec, nanosec=nanosec))
+    return SimpleNamespace(header=header, format=format_, data=data)
+
+
+def apply_pose(points: StoredPoints, pose: Any) -> StoredPoints:
+    """Transform points (N, 3) by a foxglove.Pose, (x, y, z, w, x, y, z)."""
+    shift, turn = np.array(pose[:3], float), np.array(pose[3:], float)
+    if not np.linalg.norm(turn):  # not given
+        turn = np.array([1.0, 0, 0, 0])
+    matrix = rotations_from_quaternions(turn)
+    if np.array_equal(matrix, np.eye(3)) and not shift.any():
+        return points
+    return points._replace(xyz=transform_points(points.xyz, matrix, shift))
+
+
+def _of_json(data: bytes) -> dict[str, Any]:
+    content = json.loads(data)
+    pose = content.get("pose") or {}
+    place, turn = pose.get("position") or {}, pose.get("orientation") or {}
+    time = content.get("timestamp") or {}
+    try:
+        body = base64.b64decode(content["data"], validate=True)
+    except binascii.Error as error:
+        raise ValueError(f"its data are not Base64 ({error})") from None
+    return content | {
+        "data": body,
+        "time": (int(time.get("sec", 0)), int(time.get("nsec", 0))),
+        "pose": [*(place.get(key, 0) for key in "xyz"), *(turn.get(key, 0) for key in "wxyz")],
+    }
+
+
+def _of_protobuf(data: bytes) -> dict[str, Any]:
+    content: dict[str, Any] = {"frame_id": "", "point_stride": 0, "data": b"", "fields": [], "time": (0, 0)}
+    content["pose"] = [0.0] * 7
+    for number, value in _wire(data):
+        if number == 1:
+            time = dict(_wire(value))
+            content["time"] = time.get(1, 0), time.get(2, 0)
+        elif number == 2:
+            content["frame_id"] = value.decode(errors="replace")
+        elif number == 3:
+            parts = dict(_wire(value))
+            place, turn = dict(_wire(parts.get(1, b""))), dict(_wire(parts.get(2, b"")))
+            content["pose"] = [
+                *(_double(place, key) for key in (1, 2, 3)),
+                *(_double(turn, key) for key in (4, 1, 2, 3)),
+            ]
+        elif number == 4:
+            content["point_stride"] = int.from_bytes(value, "little")
+        elif number == 5:
+            field = dict(_wire(value))
+            offset = int.from_bytes(field.get(2, b""), "little")
+            content["fields"].append({"name": field[1].decode(), "offset": offset, "type": field.get(3, 0)})
+        elif number == 6:
+            content["data"] = value
+    return content
+
+
+def _double(fields: dict[int, Any], key: int) -> float:
+    return float(struct.unpack("<d", fields[key])[0]) if key in fields else 0.0
+
+
+def _wire(data: bytes) -> Iterator[tuple[int, Any]]:
+    """Yield number and value of each field of a Protobuf message: integers, or bytes of any other type."""
+    position = 0
+    while position < len(data):
+        key, position = _varint(data, position)
+        kind = key & 7
+        if kind == 0:
+            value, position = _varint(data, position)
+            yield key >> 3, value
+            continue
+        if kind == 2:
+            size, position = _varint(data, position)
+        elif kind in (1, 5):
+            size = 8 if kind == 1 else 4
+        else:
+            raise ValueError(f"a Protobuf field of kind {kind}")
+        if position + size > len(data):
+            raise ValueError("the message breaks off")
+        yield key >> 3, data[position : position + size]
+        position += size
+
+
+def _varint(data: bytes, position: int) -> tuple[int, int]:
+    value = shift = 0
+    while True:
+        byte = data[position]
+        value |= (byte & 0x7F) << shift
+        position, shift = position + 1, shift + 7
+        if not byte & 0x80:
+            return value, position
+        if shift > 63:
+            raise ValueError("a number of more than 64 bits")
+
 
 # sensor_msgs/PointField: datatypes 1 to 8.
 _DATATYPES = ("i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8")

@@ -11,7 +11,6 @@ from numpy.typing import ArrayLike, NDArray
 from asca_pillars.base.errors import DatasetError
 from asca_pillars.base.progress import SILENT, Reporter
 from asca_pillars.data.kitti import KittiSplit
-from asca_pillars.sim.report.label_statistics import fits_of, label_statistics
 from asca_pillars.sim.report.reference import (
     BAND_M,
     CLASSES,
@@ -26,6 +25,8 @@ from asca_pillars.sim.report.scan_statistics import (
     MATERIALS,
     OBJECTS,
     ScanRecord,
+    fits_of,
+    label_statistics,
     measure_scan,
     scan_statistics,
     unit_histograms,

@@ -80,14 +80,14 @@ def write_like(folder: Path, result: LikeForLike) -> None:
 
 def _tables(result: LikeForLike) -> list[tuple[tuple[str, ...], list[tuple[str, ...]], int]]:
     tables: list[tuple[tuple[str, ...], list[tuple[str, ...]], int]]
-    tables = [(_COLUMNS, [_cells(row) for row in result.rows], _LEFT)]
+    tables = [(_COLUMNS, [_like_cells(row) for row in result.rows], _LEFT)]
     if result.firing is not None:
         pairs = [_firing_cells(*pair) for pair in zip(*result.firing, strict=True)]
         tables.append((_FIRING, pairs, _FIRING_LEFT))
     return tables
 
 
-def _cells(row: LikeRow) -> tuple[str, ...]:
+def _like_cells(row: LikeRow) -> tuple[str, ...]:
     low, high = row.ratio_interval
     interval = f"{low:.2f} to {high:.2f}" if np.isfinite([low, high]).all() else ""
     ratio = f"{row.ratio:.2f}" if np.isfinite(row.ratio) else ""

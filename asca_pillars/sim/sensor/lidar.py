@@ -5,6 +5,8 @@ Random numbers per scan (calibration errors, thresholds) are drawn here; those p
 
 The scan is taken as if the car did not move: KITTI's scans are corrected for ego motion. Others do move during
 a scan, but the laser sweeps over one in some milliseconds, in which it moves less than its label box is loose.
+
+The Velodyne HDL-64E of KITTI: tables fitted to its scans that a data sheet does not give.
 """
 
 from dataclasses import dataclass, fields
@@ -14,7 +16,42 @@ import numpy.typing as npt
 
 from asca_pillars.base.errors import ConfigError
 from asca_pillars.base.strict import Strict
-from asca_pillars.sim.sensor import hdl64
+
+# fmt: off
+# Fitted to points: laser k reaches z = origin_z[k] + rho tan(elevation[k]) at horizontal distance rho.
+ELEVATION_DEG = (
+    1.937, 1.574, 1.305, 0.872, 0.579, 0.181, -0.089, -0.452, -0.803, -1.201, -1.494, -1.833, -2.208, -2.547, -2.874,
+    -3.236, -3.539, -3.936, -4.216, -4.588, -4.914, -5.251, -5.611, -5.958, -6.329, -6.676, -6.999, -7.287, -7.679,
+    -8.058, -8.310, -8.711, -9.026, -9.574, -10.063, -10.471, -10.957, -11.599, -12.115, -12.562, -13.041, -13.485,
+    -14.048, -14.598, -15.189, -15.657, -16.177, -16.554, -17.187, -17.730, -18.323, -18.797, -19.320, -19.737,
+    -20.222, -20.788, -21.318, -21.936, -22.438, -22.857, -23.323, -23.971, -24.507, -24.999,
+)
+# Origin heights of the first and last laser of the upper and of the lower block, metres.
+ORIGIN_Z_M = ((0.2091, 0.1978), (0.1258, 0.1163))
+# Reflectance reported by each laser for the same surface, relative to a typical laser: constant over recording days.
+RING_GAIN = (
+    1.22, 1.05, 0.96, 0.90, 1.15, 0.96, 1.22, 1.02, 1.19, 0.93, 1.05, 1.12, 1.22, 1.12, 1.00, 1.02, 1.06, 1.09,
+    1.06, 0.92, 1.06, 0.69, 1.06, 1.12, 0.91, 1.03, 1.10, 1.12, 1.09, 0.82, 1.10, 1.08, 0.93, 0.93, 1.01, 0.64,
+    0.45, 1.04, 1.23, 1.20, 0.93, 1.04, 0.56, 1.04, 1.04, 1.09, 1.09, 0.97, 0.86, 1.12, 1.23, 0.43, 1.01, 0.78,
+    0.75, 1.01, 1.09, 1.23, 0.75, 0.75, 0.78, 1.12, 1.27, 1.20,
+)
+# Rings [first, beyond) occluded by the own car, per 3 degrees of azimuth from straight ahead, counter-clockwise.
+EGO_FIRST_RING = (
+    57, 57, 57, 58, 58, 60, 62, 64, 64, 61, 62, 61, 62, 64, 64, 64, 64, 64, 64, 64, 64, 64, 64, 64, 64, 64, 64,
+    64, 64, 64, 64, 64, 64, 64, 64, 64, 64, 64, 64, 64, 64, 64, 57, 56, 56, 60, 61, 62, 63, 63, 61, 59, 53, 42,
+    42, 53, 53, 52, 52, 52, 52, 52, 52, 52, 53, 49, 42, 54, 58, 60, 64, 64, 63, 63, 62, 57, 57, 56, 56, 64, 64,
+    64, 64, 64, 64, 64, 64, 64, 64, 64, 64, 64, 51, 49, 49, 47, 47, 47, 48, 48, 48, 54, 64, 64, 64, 64, 64, 61,
+    60, 61, 62, 60, 64, 63, 61, 59, 58, 57, 57, 57,
+)
+EGO_BEYOND_RING = (
+    64, 64, 64, 64, 64, 64, 64, 64, 64, 64, 63, 64, 63, 64, 64, 64, 64, 64, 64, 64, 64, 64, 64, 64, 64, 64, 64,
+    64, 64, 64, 64, 64, 64, 64, 64, 64, 64, 64, 64, 64, 64, 64, 64, 64, 64, 64, 64, 63, 64, 64, 64, 64, 64, 64,
+    64, 64, 64, 64, 64, 64, 64, 64, 64, 64, 64, 64, 64, 64, 64, 64, 64, 64, 64, 64, 63, 64, 64, 64, 61, 64, 64,
+    64, 64, 64, 64, 64, 64, 64, 64, 64, 64, 64, 54, 64, 62, 63, 63, 61, 61, 59, 59, 55, 64, 64, 64, 64, 64, 64,
+    64, 64, 63, 61, 64, 64, 64, 64, 64, 64, 64, 64,
+)
+# fmt: on
+
 
 MAX_COLUMNS = 4096  # the ray caster identifies firings by ring * 4096 + column
 
@@ -35,12 +72,12 @@ class Lidar(Strict):
         range_m: nearest and farthest reported range.
     """
 
-    elevation_deg: tuple[float, ...] = hdl64.ELEVATION_DEG
-    origin_z_m: tuple[tuple[float, float], ...] = hdl64.ORIGIN_Z_M
+    elevation_deg: tuple[float, ...] = ELEVATION_DEG
+    origin_z_m: tuple[tuple[float, float], ...] = ORIGIN_Z_M
     azimuth_counts: int = 4000
     azimuth_steps: tuple[int, ...] = (2, 2, 2, 2, 2, 2, 1)
-    ego_first_ring: tuple[int, ...] = hdl64.EGO_FIRST_RING
-    ego_beyond_ring: tuple[int, ...] = hdl64.EGO_BEYOND_RING
+    ego_first_ring: tuple[int, ...] = EGO_FIRST_RING
+    ego_beyond_ring: tuple[int, ...] = EGO_BEYOND_RING
     elevation_jitter_deg: float = 0.03  # known to the sensor: a scan of other angles, not an error
     range_m: tuple[float, float] = (2.0, 80.0)
     range_sigma_m: tuple[float, float] = (0.005, 0.010)  # drawn once per scan
@@ -59,7 +96,7 @@ class Lidar(Strict):
     # (0: not), and the lasers of the first block lose `near_fade` of it at zero range.
     response: float = 0.6
     dark_offset: float = 0.03
-    ring_gain: tuple[float, ...] = hdl64.RING_GAIN
+    ring_gain: tuple[float, ...] = RING_GAIN
     ring_gain_sigma: float = 0.06  # of the logarithm, once per scan: the lasers of two sensors differ
     focus_m: float = 13.0
     fade_m: float = 33.0

@@ -2,10 +2,15 @@
 
 from asca_deploy.benchmark.bench_report import BenchmarkReport, benchmark
 from asca_deploy.benchmark.cold import ColdStart, cold_start
-from asca_deploy.benchmark.matrix import MatrixRow, measure_matrix
-from asca_deploy.benchmark.roofline import Roofline, measure_roofline
-from asca_deploy.benchmark.speed_comparison import Comparison, Contestant, alternate, compare
-from asca_deploy.benchmark.throughput import ScalingRow, Throughput, measure_scaling, measure_throughput
+from asca_deploy.benchmark.speed_comparison import Comparison, Contestant, MatrixRow, alternate, compare, measure_matrix
+from asca_deploy.benchmark.timing import (
+    Roofline,
+    ScalingRow,
+    Throughput,
+    measure_roofline,
+    measure_scaling,
+    measure_throughput,
+)
 
 __all__ = [
     "BenchmarkReport",

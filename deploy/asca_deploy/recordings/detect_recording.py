@@ -37,15 +37,14 @@ from asca_pillars.base.errors import ConfigError, ScanError
 from asca_pillars.base.files import atomic_path
 from asca_pillars.base.installation import require
 from asca_pillars.base.progress import Progress, Remark, Reporter
-from asca_pillars.base.schema import to_dict
+from asca_pillars.base.settings import to_dict
 from asca_pillars.data.boxes.detector_scope import DetectorScope, detector_scope
 from asca_pillars.data.kitti import read_calibration
 from asca_pillars.detection.spec import ScoreThresholds
 from asca_pillars.pictures.video import VideoView
 from asca_pillars.scans.mounting import Mounting
 from asca_pillars.scans.recordings.images import NearestImages
-from asca_pillars.scans.recordings.open_recording import open_recording, recording_files
-from asca_pillars.scans.recordings.recorded_scans import RecordedScan, RecordedScans
+from asca_pillars.scans.recordings.recorded_scans import RecordedScan, RecordedScans, open_recording, recording_files
 from asca_pillars.scans.recordings.recording import topics_text
 from asca_pillars.scans.scan_settings import ScanSettings
 from asca_pillars.scans.transforms import Poses, read_poses

@@ -20,9 +20,14 @@ from asca_pillars.base.errors import AscaError, ConfigError, ScanError
 from asca_pillars.scans.ground_height import NamedPoints, estimate_named_height
 from asca_pillars.scans.mounting import Mounting
 from asca_pillars.scans.recordings.point_cloud2 import point_cloud_points
-from asca_pillars.scans.scan_input import common_reflectance_scale, has_finite_point
 from asca_pillars.scans.scan_reader import finite_scan, read_scan
-from asca_pillars.scans.scan_settings import SAMPLE_SCANS, SEARCHED_SCANS, ScanSettings
+from asca_pillars.scans.scan_settings import (
+    SAMPLE_SCANS,
+    SEARCHED_SCANS,
+    ScanSettings,
+    common_reflectance_scale,
+    has_finite_point,
+)
 
 _SCALE_SCANS = 16  # with points, that decide the reflectance's scale, as in a recording
 _WARM_UP_SCANS = 3

@@ -10,10 +10,9 @@ from asca_deploy.bundle import BACKBONE, BUNDLE_FOLDER, ENCODER, CanvasFormat, P
 from asca_deploy.pillar.pipeline import PillarPipeline
 from asca_export import graphs
 from asca_export.bundle_writer import DEFAULTS, ExportOptions, draft_bundle, require_parity_scans, write_bundle
-from asca_export.fast_forms import FastBackbone, fast_encoder
+from asca_export.fast_forms import FastBackbone, MarkedEncoder, MaskedBackbone, fast_encoder
 from asca_export.int8 import calibration_scans, quantize_bundle
 from asca_export.parity import check_parity
-from asca_export.pillar.masked_forms import MarkedEncoder, MaskedBackbone
 from asca_export.sparse_forms import SparseBackbone, export_sparse_backbone, sparse_multiply_accumulates
 from asca_pillars.base.errors import ExportError
 from asca_pillars.base.files import atomic_directory

@@ -50,7 +50,7 @@ class GatheredSetAbstraction(_Layers):
 
 
 class GroupedSetAbstraction(_Layers):
-    """Set abstraction on grouped balls (`ops.points.ball_layouts`): the first layer runs once per point and query."""
+    """Set abstraction on grouped balls (`ops.points.neighbors`): the first layer runs once per point and query."""
 
     def forward(self, positions: Tensor, features: Tensor, queries: Tensor, balls: GroupedBalls[Tensor]) -> Tensor:
         """Compute `SetAbstraction.forward`: (Q, out_channels)."""

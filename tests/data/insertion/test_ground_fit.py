@@ -14,7 +14,7 @@ from asca_pillars.data.insertion.ground_fit import (
     fit_plane,
 )
 from asca_pillars.geometry.boxes import points_in_boxes
-from asca_pillars.geometry.common_plane import plane_heights
+from asca_pillars.scans.ground_height import plane_heights
 from tests.data.insertion.simple_streets import cast, stand
 
 SLOPES = st.floats(-0.06, 0.06)

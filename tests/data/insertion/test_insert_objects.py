@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from asca_pillars.base.errors import ConfigError, DatasetError
-from asca_pillars.cli.prepare import prepare
+from asca_pillars.cli.train import prepare
 from asca_pillars.config.tree import Config, DataConfig
 from asca_pillars.data.augment import augment
 from asca_pillars.data.boxes.box_records import json_line, records_from
@@ -237,7 +237,7 @@ def test_processes_of_the_database_and_plain_validation(root: Path, monkeypatch:
     )
     open_inserter(KittiSplit(root, "train"), dataclasses.replace(config("gt_aug"), data=DataConfig(workers=3)))
     assert asked == [3]
-    monkeypatch.setattr("asca_pillars.data.training_frames.prepare_inserter", lambda *_: pytest.fail("built"))
+    monkeypatch.setattr("asca_pillars.data.augment.prepare_inserter", lambda *_: pytest.fail("built"))
     sample = open_dataset(root, config("rs_aug"), training=False).sample(0, 0)
     assert np.array_equal(sample.frame.points, frame_of(root, 0).points)
 

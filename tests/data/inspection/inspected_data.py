@@ -13,7 +13,7 @@ from asca_pillars.config.tree import Config, DataConfig, pillar_spec
 from asca_pillars.data.inspection.findings import Finding, findings
 from asca_pillars.data.inspection.inspect_dataset import Inspection, inspect_dataset
 from asca_pillars.data.kitti import KittiSplit
-from asca_pillars.scans.scan_input import stored_points
+from asca_pillars.scans.scan_settings import stored_points
 from tests.helpers.scenes import GRID, SPEC
 
 Points = NDArray[np.float32]

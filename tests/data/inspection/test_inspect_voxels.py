@@ -8,15 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from asca_pillars.base.schema import to_dict
-from asca_pillars.base.settings import shipped_configs
+from asca_pillars.base.settings import shipped_configs, to_dict
 from asca_pillars.cli.inspect import inspect
 from asca_pillars.config.tree import Config, load_config
 from asca_pillars.data.boxes.box_split import BoxSplit
-from asca_pillars.data.inspection.findings import findings
+from asca_pillars.data.inspection.findings import findings, propose
 from asca_pillars.data.inspection.inspect_dataset import inspect_dataset
 from asca_pillars.data.inspection.measurements import measure_scan
-from asca_pillars.data.inspection.proposal import propose
 from asca_pillars.data.kitti import KittiSplit
 from asca_pillars.geometry.overlap import aligned_bev_iou
 from asca_pillars.ops.pv_rcnn.voxels import voxelize

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from asca_pillars.data.insertion.ground_fit import fit_ground
-from asca_pillars.evaluation.errors.false_detections import Surroundings, describe
+from asca_pillars.evaluation.errors.box_errors import Surroundings, describe
 from tests.evaluation.errors.made_frames import GROUND_Z_M, column, ground
 
 PERSON = np.array([15.0, 0.0, GROUND_Z_M + 0.9, 0.8, 0.6, 1.8, 0.3])

@@ -24,8 +24,8 @@ from asca_pillars.base.errors import ExportError
 from asca_pillars.config.pillar import PillarModel
 from asca_pillars.data.kitti import KittiSplit
 from asca_pillars.detection.decode import VOTE_SCORE, HeadMaps
+from asca_pillars.models.build import ScanDetector
 from asca_pillars.models.pillar.network import PillarDetector
-from asca_pillars.models.scan_detector import ScanDetector
 from asca_pillars.ops.pillar.spec import PillarSpec
 from asca_pillars.scans.input_check import ExpectedInput, measure_expected_input
 from asca_pillars.scans.scan_reader import read_scan

@@ -12,11 +12,11 @@ from torch import nn
 
 from asca_pillars.base.errors import ConfigError
 from asca_pillars.config.pillar import LossConfig, NetworkConfig, PillarModel
+from asca_pillars.models.map_backbone import at_active_cells
 from asca_pillars.models.pillar.loss import TargetBatch, detection_loss
 from asca_pillars.models.pillar.neck import RPNNeck, SparseRPNNeck, block_layers
 from asca_pillars.models.pillar.network import PillarDetector, PillarOutputs, build_pillar_detector
 from asca_pillars.models.pillar.preparation import LabeledPillars, PillarBatch, Placement, batch_pillars
-from asca_pillars.models.sparse_conv import at_active_cells
 from asca_pillars.ops.pillar.neck_rulebooks import MaskRule, NeckRulebookBuilder
 from tests.helpers.scenes import SPEC, make_scene
 from tests.models.pillar.loss_scenes import batched, scene_targets

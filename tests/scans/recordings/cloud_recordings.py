@@ -8,8 +8,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from asca_pillars.scans.recordings.messages import typestore
-from asca_pillars.scans.recordings.open_recording import open_recording
-from asca_pillars.scans.recordings.recorded_scans import RecordedScan, RecordedScans
+from asca_pillars.scans.recordings.recorded_scans import RecordedScan, RecordedScans, open_recording
 from benchmarks.made_recordings import point_cloud2
 
 CLOUD = "sensor_msgs/msg/PointCloud2"

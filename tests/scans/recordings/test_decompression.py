@@ -24,8 +24,7 @@ from rosbags.rosbag2 import Writer as Writer2
 from asca_pillars.base.errors import ScanError
 from asca_pillars.scans.recordings import decompression
 from asca_pillars.scans.recordings.decompression import decompress_bz2, decompress_lz4, decompress_zstd
-from asca_pillars.scans.recordings.open_recording import is_recording, open_recording
-from asca_pillars.scans.recordings.recorded_scans import RecordedScans
+from asca_pillars.scans.recordings.recorded_scans import RecordedScans, is_recording, open_recording
 from asca_pillars.scans.scan_settings import ScanSettings
 from benchmarks.made_recordings import point_cloud2
 from tests.scans.recordings.cloud_recordings import (

@@ -12,7 +12,7 @@ pytest.importorskip("rosbags", reason="needs pip install -e '.[recordings]'")
 
 from asca_pillars.base.errors import ScanError
 from asca_pillars.scans.recordings.images import CameraImage, ImageKind, NearestImages, read_image
-from asca_pillars.scans.recordings.open_recording import open_recording
+from asca_pillars.scans.recordings.recorded_scans import open_recording
 from asca_pillars.scans.recordings.recording import Message
 from tests.scans.recordings.cloud_recordings import (
     START_NS,

@@ -16,8 +16,7 @@ from mcap.writer import CompressionType, IndexType
 
 from asca_pillars.base.errors import ScanError
 from asca_pillars.scans.recordings import decompression, mcap_files
-from asca_pillars.scans.recordings.open_recording import open_recording
-from asca_pillars.scans.recordings.recorded_scans import RecordedScans
+from asca_pillars.scans.recordings.recorded_scans import RecordedScans, open_recording
 from asca_pillars.scans.recordings.recording import Recording, Topic
 from tests.scans.recordings.cloud_recordings import (
     CLOUD,

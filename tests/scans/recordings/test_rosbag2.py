@@ -11,8 +11,7 @@ import pytest
 pytest.importorskip("rosbags", reason="needs pip install -e '.[recordings]'")
 
 from asca_pillars.base.errors import ScanError
-from asca_pillars.scans.recordings.open_recording import open_recording
-from asca_pillars.scans.recordings.recorded_scans import RecordedScans
+from asca_pillars.scans.recordings.recorded_scans import RecordedScans, open_recording
 from asca_pillars.scans.transforms import read_poses
 from tests.scans.recordings.cloud_recordings import (
     CLOUD,

@@ -11,7 +11,7 @@ from asca_pillars.evaluation.errors.label_fit import label_fit
 from asca_pillars.sim.bodies.cycles import bicycle, cyclist_body
 from asca_pillars.sim.bodies.people import SHARES, draw_burden, pedestrian_body
 from asca_pillars.sim.bodies.vehicles import car_body, draw_style
-from asca_pillars.sim.report.label_statistics import COLUMNS, WINDOW_RETURNS, window_returns
+from asca_pillars.sim.report.scan_statistics import COLUMNS, WINDOW_RETURNS, window_returns
 from asca_pillars.sim.scene_config import SceneConfig
 from asca_pillars.sim.world.placement import Target
 from asca_pillars.sim.world.scene import BEAM_M_PER_M, body_of

@@ -7,9 +7,15 @@ import pytest
 
 from asca_pillars.data.kitti import objects_from_boxes
 from asca_pillars.sim.report.comparison import Measured, compare
-from asca_pillars.sim.report.label_statistics import COLUMNS, WINDOW_RETURNS, fits_of, object_fits, window_returns
 from asca_pillars.sim.report.reference import CLASSES, Fit, kitti_reference
-from asca_pillars.sim.report.scan_statistics import ScanRecord
+from asca_pillars.sim.report.scan_statistics import (
+    COLUMNS,
+    WINDOW_RETURNS,
+    ScanRecord,
+    fits_of,
+    object_fits,
+    window_returns,
+)
 from asca_pillars.sim.report.tables import fits_table
 from tests.helpers.scenes import CALIBRATION
 

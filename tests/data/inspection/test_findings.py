@@ -9,14 +9,13 @@ import pytest
 import yaml
 
 from asca_pillars.base.errors import AscaError, DatasetError, OutputError
-from asca_pillars.base.schema import parse
+from asca_pillars.base.settings import parse
 from asca_pillars.config.pillar import PillarModel
 from asca_pillars.config.tree import Config, DataConfig, load_config, pillar_spec
 from asca_pillars.data.boxes.box_records import json_line, read_frames, records_from
 from asca_pillars.data.boxes.box_split import BoxSplit
-from asca_pillars.data.inspection.findings import findings
+from asca_pillars.data.inspection.findings import differences, findings, propose
 from asca_pillars.data.inspection.inspect_dataset import inspect_dataset
-from asca_pillars.data.inspection.proposal import differences, propose
 from asca_pillars.ops.pillar.grid import PillarGrid
 from asca_pillars.ops.pillar.prepare import PillarLimits, pillarize
 from asca_pillars.ops.pillar.spec import PillarSpec

@@ -10,8 +10,7 @@ pytest.importorskip("rosbags", reason="needs pip install -e '.[recordings]'")
 
 from asca_pillars.base.errors import ScanError
 from asca_pillars.scans.recordings import recorded_scans
-from asca_pillars.scans.recordings.open_recording import is_recording, open_recording
-from asca_pillars.scans.recordings.recorded_scans import SEARCHED_MESSAGES, RecordedScans
+from asca_pillars.scans.recordings.recorded_scans import SEARCHED_MESSAGES, RecordedScans, is_recording, open_recording
 from benchmarks.made_recordings import TOPIC, write_recording
 from tests.scans.recordings.cloud_recordings import cloud_points, clouds, laid_out, read_scans, stamps, write_mcap
 

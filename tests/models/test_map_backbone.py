@@ -7,8 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch.nn import functional as F  # noqa: N812  (torch's own convention)
 
-from asca_pillars.models import sparse_conv as module
-from asca_pillars.models.sparse_conv import linear_rows, rounded_rows, rulebook_conv
+from asca_pillars.models import map_backbone as module
+from asca_pillars.models.map_backbone import linear_rows, rounded_rows, rulebook_conv
 from asca_pillars.ops.pv_rcnn.rulebooks import PV_RCNN_STRIDED, SUBMANIFOLD
 from asca_pillars.ops.sparse.rulebooks import CellMap, Convolution, Shape, map_convolution
 
