@@ -168,7 +168,7 @@ def time_variants(todo: Sequence[Run], family: Family, split: KittiSplit, consol
     from asca_deploy import Detector
     from asca_deploy.benchmark import alternate
     from asca_export.bundle_writer import MIN_SCANS
-    from asca_export.export_checkpoint import export_bundle
+    from asca_export.export import export_bundle
     from asca_pillars.data.frames import read_frame
     from asca_pillars.models.build import load_checkpoint
 

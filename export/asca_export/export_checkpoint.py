@@ -1,7 +1,4 @@
-"""Export of a checkpoint, or of a bundle that holds its weights: `asca export`.
-
-Export of a checkpoint to a bundle.
-"""
+"""Export of a checkpoint, or of a bundle that holds its weights: `asca export`."""
 
 import json
 from collections.abc import Callable, Sequence
@@ -14,10 +11,6 @@ from numpy.typing import NDArray
 
 from asca_deploy.bundle import BUNDLE_FOLDER, Bundle
 from asca_deploy.shipped import bundle_of_checkpoint, find_checkpoint
-from asca_export.bundle_writer import DEFAULTS, ExportOptions
-from asca_export.pillar.export import export_pillar_bundle, require_maskable
-from asca_export.pv_rcnn.export import export_pv_rcnn_bundle
-from asca_export.two_stage.export import export_refine_bundle
 from asca_pillars.base.errors import ConfigError, TrainingError
 from asca_pillars.base.installation import require
 from asca_pillars.base.own_files import require_not_input, require_replaceable
@@ -25,7 +18,6 @@ from asca_pillars.base.progress import Progress, Reporter
 from asca_pillars.base.settings import with_overrides
 from asca_pillars.config.pillar import PillarModel
 from asca_pillars.detection.spec import DetectorSpec, ScoreThresholds
-from asca_pillars.models.build import Checkpoint
 from asca_pillars.ops.pillar.spec import PillarSpec
 from asca_pillars.scans.find_scans import find_scans
 from asca_pillars.scans.scan_reader import read_scan
@@ -33,43 +25,6 @@ from asca_pillars.scans.scan_reader import read_scan
 if TYPE_CHECKING:
     from asca_pillars.config.tree import ModelConfig
     from asca_pillars.models.build import Checkpoint
-
-
-EXPORTERS: dict[str, Callable[[Checkpoint, Any, Any, ExportOptions], Bundle]] = {
-    "pillar": export_pillar_bundle,
-    "pillar_refine": export_refine_bundle,
-    "pv_rcnn": export_pv_rcnn_bundle,
-}
-"""Exporters by `model.kind`."""
-
-
-def export_bundle(
-    checkpoint: Checkpoint,
-    out: str | Path,
-    scans: Sequence[NDArray[np.float32]],
-    options: ExportOptions = DEFAULTS,
-) -> Bundle:
-    """Write a checkpoint's graphs and bundle.json, and prove on `scans` that they are its detector.
-
-    With `options.calibration` the proven float graphs then become 8-bit ones, and the bundle says how far those are
-    from them. Nothing appears at `out` unless the proof holds; a bundle that stood there stays until then.
-
-    Args:
-        checkpoint: from `load_checkpoint`.
-        out: the bundle's folder.
-        scans: at least MIN_SCANS scans (N, 4), metres, LiDAR frame, and reflectance. If the checkpoint does not say
-            what its training scans looked like, these stand in for them, and the manifest says so.
-        options: see `ExportOptions`.
-
-    Raises:
-        ExportError: too few scans, to prove parity or to calibrate on; a network that has not the form or the
-            precision that is asked for; or PyTorch and onnxruntime differ; names the first stage that does.
-    """
-    model = checkpoint.config.model
-    if options.dense_neck:
-        require_maskable(model, int8=options.calibration is not None)
-    return EXPORTERS[model.kind](checkpoint, out, scans, options)
-
 
 PARITY_SCANS, PARITY_SEED = 8, 2**31  # seeds far from those that people train with
 CALIBRATION_SCANS, CALIBRATION_SEED = 96, 2**31 + 1
@@ -131,6 +86,7 @@ def export(
     """
     require("train")
     from asca_export.bundle_writer import ExportOptions
+    from asca_export.export import export_bundle
     from asca_export.pillar.export import require_maskable
 
     checkpoint, out, reporter = Path(checkpoint), Path(out), Reporter(progress)

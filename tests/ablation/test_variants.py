@@ -104,9 +104,7 @@ def test_a_base_that_a_row_would_change_otherwise_is_refused(config: str, row: s
 @pytest.mark.usefixtures("in_turn")
 def test_from_training_to_the_table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     # Its own graphs would take ten seconds; what is exported of a row is tested in tests/export.
-    monkeypatch.setattr(
-        "asca_export.export_checkpoint.export_bundle", lambda _, folder, __: shutil.copytree(PV_RCNN, folder)
-    )
+    monkeypatch.setattr("asca_export.export.export_bundle", lambda _, folder, __: shutil.copytree(PV_RCNN, folder))
     data, base = write_dataset(tmp_path / "data", 10, val_frames=8), tmp_path / "tiny.yaml"
     config = tiny_config(FEW_BALLS, epochs=1)
     base.write_text(yaml.safe_dump(to_dict(config)))

@@ -18,7 +18,7 @@ from asca_deploy import Detector
 from asca_deploy.manifest import load_pillar_bundle
 from asca_export import graphs
 from asca_export.bundle_writer import ExportOptions
-from asca_export.export_checkpoint import export_bundle
+from asca_export.export import export_bundle
 from asca_export.fast_forms import (
     NEVER,
     STEP_VALUE,

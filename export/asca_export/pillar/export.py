@@ -29,7 +29,7 @@ def export_pillar_bundle(
     scans: Sequence[NDArray[np.float32]],
     options: ExportOptions = DEFAULTS,
 ) -> PillarBundle:
-    """Export kind pillar, see `asca_export.export_checkpoint.export_bundle`: encoder.onnx and backbone.onnx."""
+    """Export kind pillar, see `asca_export.export.export_bundle`: encoder.onnx and backbone.onnx."""
     model, detector, calibration = checkpoint.config.model, checkpoint.detector, options.calibration
     assert isinstance(model, PillarModel) and isinstance(detector, PillarDetector), "it is of kind pillar"
     require_parity_scans(scans)

@@ -28,7 +28,7 @@ def export_pv_rcnn_bundle(
     scans: Sequence[NDArray[np.float32]],
     options: ExportOptions = DEFAULTS,
 ) -> PvRcnnBundle:
-    """Export kind pv_rcnn, see `asca_export.export_checkpoint.export_bundle`: four graphs.
+    """Export kind pv_rcnn, see `asca_export.export.export_bundle`: four graphs.
 
     With `options.calibration` the first stage is put in 8 bits; what follows the proposals stays in float32.
     """

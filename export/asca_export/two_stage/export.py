@@ -45,7 +45,7 @@ def export_refine_bundle(
     scans: Sequence[NDArray[np.float32]],
     options: ExportOptions = DEFAULTS,
 ) -> PillarBundle:
-    """Export kind pillar_refine, see `export_checkpoint.export_bundle`: the first stage's graphs and refine.onnx.
+    """Export kind pillar_refine, see `export.export_bundle`: the first stage's graphs and refine.onnx.
 
     The first stage is the one that the checkpoint was trained on. With `options.calibration` it then gives way to its
     8-bit form: of a bundle the one named like it with `_int8`, of a checkpoint one made on those scans. The second
