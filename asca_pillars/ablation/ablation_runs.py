@@ -1,9 +1,7 @@
-"""The runs of an ablation: trained, evaluated and kept, on equal terms.
+"""The runs of an ablation, trained and evaluated on equal terms, and the tables of their results.
 
 Every run is `asca train` with one base configuration and a few overrides, in a process of its own; finished runs are
 kept, so that an interrupted ablation can be resumed.
-
-Markdown tables of an ablation: training, results, spread over the seeds.
 """
 
 import json

@@ -1,9 +1,7 @@
-"""Writing files so that a crash, a kill or a loss of power never leaves half of one under its final name.
+"""Writing of files so that a crash never leaves half of one under its final name, and checks before they are read.
 
 What is being written has a name of its own beside its target (`locks`), and gets the final name when it is complete and
 on the disk. What a command may replace is in `base.own_files`.
-
-Check that an input path is a regular file with content of its own, before it is read.
 """
 
 import contextlib

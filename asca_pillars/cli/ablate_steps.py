@@ -27,8 +27,8 @@ from asca_pillars.base.own_files import (
 )
 from asca_pillars.base.system import command_line, cpu_model, package_versions
 from asca_pillars.config.tree import Config, DataConfig, load_config
-from asca_pillars.data.boxes.box_split import open_split
 from asca_pillars.data.kitti import KittiSplit
+from asca_pillars.data.open_split import open_split
 
 COMMAND = "asca ablate"
 RESULTS_FILE = "results.md"

@@ -64,7 +64,7 @@ def average_weights(
     from asca_pillars.base.progress import Reporter
     from asca_pillars.cli.progress import Bars
     from asca_pillars.models.checkpoint_file import require_new_checkpoint
-    from asca_pillars.training.batch_norm import average_checkpoints, update_batch_norm
+    from asca_pillars.training.average_weights import average_checkpoints, update_batch_norm
 
     if split is not None and update_bn is None:
         raise ConfigError(f"--split {split}: names frames of --update-bn; give that too, or leave it out")

@@ -193,10 +193,10 @@ def _inspect_dataset(
     from asca_pillars.cli import inspect_tables as show
     from asca_pillars.cli.progress import Bars
     from asca_pillars.config.tree import load_config
-    from asca_pillars.data.boxes.box_split import open_split
     from asca_pillars.data.inspection.findings import findings, propose_config
     from asca_pillars.data.inspection.inspect_dataset import inspect_dataset
     from asca_pillars.data.inspection.measurements import input_cells
+    from asca_pillars.data.open_split import open_split
     from asca_pillars.pictures.training_pictures import draw_frames, require_replaceable_pictures
 
     report_json = "asca inspect --json", json_object("config", "frames_in_split", "states_mounting", "findings")

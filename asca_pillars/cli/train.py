@@ -1,7 +1,4 @@
-"""`asca train`: training by a YAML on a dataset, into a run's folder.
-
-`asca prepare`: computation of the caches for insertion before training instead of during its first epoch.
-"""
+"""`asca prepare` and `asca train`: training by a YAML on a dataset into a run's folder, and its caches before it."""
 
 from pathlib import Path
 from typing import Annotated, Any

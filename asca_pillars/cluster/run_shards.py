@@ -1,6 +1,6 @@
 """A run of shards from its start to its end: the cluster, the progress, and the folders that machines write to.
 
-Shards on the workers of a Ray cluster; no other module uses Ray.
+No other module uses Ray, on whose workers the shards of a cluster run.
 """
 
 import contextlib

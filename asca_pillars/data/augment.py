@@ -1,7 +1,4 @@
-"""Random augmentation of a labelled frame and corruption of its points, with the given random generator.
-
-Training frames before they become tensors: read, with objects inserted, augmented.
-"""
+"""Training frames before they become tensors: read, with objects inserted, augmented at random."""
 
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -12,9 +9,9 @@ from numpy.typing import NDArray
 
 from asca_pillars.base.progress import SILENT, Reporter
 from asca_pillars.config.tree import AugmentConfig, Config
-from asca_pillars.data.boxes.box_split import open_split
 from asca_pillars.data.frames import LabeledFrame, LabeledSplit, Motion, read_frame
 from asca_pillars.data.insertion.insert_objects import Inserter, insert_objects, prepare_inserter
+from asca_pillars.data.open_split import open_split
 from asca_pillars.detection.spec import DetectorSpec
 from asca_pillars.geometry.boxes import points_in_boxes, wrap_angle
 from asca_pillars.geometry.frame_change import transform_points

@@ -1,6 +1,4 @@
-"""Labelled frames: points with their ground-truth boxes and classes.
-
-Interface of a dataset of any layout for training, inspection, insertion and evaluation.
+"""Labelled frames, and the interface of a dataset of any layout that they are read from.
 
 `data.kitti.KittiSplit` reads KITTI's layout, `data.boxes.box_split.BoxSplit` the layout with boxes in the LiDAR frame
 (docs/DATA.md); `data.open_split` selects between them.

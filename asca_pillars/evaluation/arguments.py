@@ -1,7 +1,4 @@
-"""Arguments of an evaluation, checks of their combinations, and its result.
-
-Detector under evaluation, and its score thresholds.
-"""
+"""Arguments of an evaluation, checks of their combinations, the detector under evaluation, and the result."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -13,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_pillars.base.errors import ConfigError
-from asca_pillars.data.boxes.box_split import open_split
 from asca_pillars.data.kitti import KittiSplit
+from asca_pillars.data.open_split import open_split
 from asca_pillars.detection.detections import Detections
 from asca_pillars.detection.spec import DetectorSpec, ScoreThresholds
 from asca_pillars.evaluation.report_page import ReportPage

@@ -7,9 +7,10 @@ from asca_pillars.base.errors import ConfigError, DatasetError
 from asca_pillars.base.files import atomic_directory, write_json
 from asca_pillars.base.progress import Reporter
 from asca_pillars.base.system import describe_environment
-from asca_pillars.data.boxes.box_split import BoxSplit, open_split
+from asca_pillars.data.boxes.box_split import BoxSplit
 from asca_pillars.data.boxes.detector_scope import detector_scope
 from asca_pillars.data.frames import LabeledSplit
+from asca_pillars.data.open_split import open_split
 from asca_pillars.evaluation.arguments import (
     Evaluation,
     EvaluationTask,

@@ -1,7 +1,4 @@
-"""Evaluation by KITTI's and Waymo's protocols: running the model, reports and pictures.
-
-Preparation of an error analysis: datasets to compare, and the report.
-"""
+"""Evaluation by KITTI's and Waymo's protocols: running the model, reports and pictures, and the error analysis."""
 
 import json
 from collections.abc import Sequence

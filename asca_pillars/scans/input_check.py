@@ -1,10 +1,7 @@
 """Comparison of a scan with the training scans, and a check of its axes; each warning names the option to set.
 
 A wrong reflectance scale, sensor height or axis degrades detection without an error; here it gives a warning.
-
-Statistics of the training scans, stored in the bundle for `input_check`.
-
-Statistics of training scans for the bundle.
+The bundle stores the statistics of the training scans.
 """
 
 from collections.abc import Iterable

@@ -1,7 +1,4 @@
-"""Point records with named fields, shared by the PCD and PLY readers.
-
-Points from NumPy arrays, of `.npy` files and of callers.
-"""
+"""Points from records with named fields, which the PCD and PLY readers share, and from NumPy arrays."""
 
 import re
 import warnings

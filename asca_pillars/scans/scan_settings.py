@@ -1,8 +1,7 @@
-"""Settings of scan reading and sensor mounting, shared by the options of commands and the keys of a dataset.yaml.
+"""Settings of scan reading and sensor mounting, and the reading of scan files by them.
 
-Reading of scan files by `ScanSettings`, with the mounting of their sensor.
-
-Scans with their stored values, and one reflectance scale for scans of the same source.
+The options of commands and the keys of a dataset.yaml share the settings. Scans of one source have one reflectance
+scale.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Sequence

@@ -1,7 +1,4 @@
-"""Transforms between the frames of a vehicle: ROS' tf, from live messages or a recording.
-
-Poses of the vehicle from a recording's nav_msgs/Odometry, interpolated in time.
-"""
+"""Transforms between the frames of a vehicle: ROS' tf, and poses from nav_msgs/Odometry, interpolated in time."""
 
 from dataclasses import dataclass
 from typing import Any

@@ -1,7 +1,4 @@
-"""Writing simulated frames in KITTI's layout.
-
-Simulation of frames in several processes, into a folder that records its settings.
-"""
+"""Writing simulated frames in KITTI's layout, in several processes, into a folder that records its settings."""
 
 import json
 import tempfile

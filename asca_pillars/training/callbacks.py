@@ -1,6 +1,6 @@
-"""Callbacks of a run: progress, Ctrl-C, the average of the weights.
+"""Callbacks of a run: progress, Ctrl-C, the average of the weights, and its checkpoints.
 
-A run's checkpoints: written whole, two generations of the last one, and the one to resume from.
+Checkpoints are written whole; there are two generations of the last one, and the one to resume from is chosen here.
 """
 
 import contextlib

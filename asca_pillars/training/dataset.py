@@ -1,6 +1,6 @@
 """Training samples: labelled frames, augmented and prepared for a family of detectors.
 
-Check of the labels before a training, which would fail without usable boxes.
+Labels are checked before a training, which would fail without usable boxes.
 """
 
 from collections import Counter

@@ -22,7 +22,7 @@ from asca_pillars.base.progress import Reporter
 from asca_pillars.config.pillar import PillarModel
 from asca_pillars.config.tree import Config, ModelConfig, TrainConfig
 from asca_pillars.config.two_stage import RefineModel
-from asca_pillars.data.boxes.box_split import open_split
+from asca_pillars.data.open_split import open_split
 from asca_pillars.models.checkpoint_file import save_weights
 from asca_pillars.models.pillar.trained import Distillation
 from asca_pillars.models.two_stage.first_stage import with_first_stage

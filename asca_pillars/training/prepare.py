@@ -5,9 +5,9 @@ from pathlib import Path
 
 from asca_pillars.base.progress import SILENT, Reporter
 from asca_pillars.config.tree import Config
-from asca_pillars.data.boxes.box_split import open_split
 from asca_pillars.data.insertion.free_space import prepare_free_spaces
 from asca_pillars.data.insertion.insert_objects import Inserter, prepare_inserter
+from asca_pillars.data.open_split import open_split
 from asca_pillars.models.build import build_preparation
 
 

@@ -1,7 +1,4 @@
-"""Detection in scan files: boxes in memory and, if wanted, as files.
-
-Time stamps of the scans of a folder: at a constant rate, or from a file.
-"""
+"""Detection in scan files: boxes in memory and, if wanted, as files, with the scans' time stamps."""
 
 import errno
 import re

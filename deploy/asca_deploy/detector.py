@@ -1,6 +1,6 @@
 """Detector without PyTorch, with the steps around the pipeline that all detector families share.
 
-Choice of the pipeline for a bundle, by its family, and of its provider.
+A bundle's family decides which pipeline is opened.
 """
 
 import logging
@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 from asca_deploy import auto, providers
 from asca_deploy.around import about_ground, merge, ranges_around, turns_around, widen_ranges, without_own_vehicle
 from asca_deploy.bundle import Bundle, PillarBundle, PvRcnnBundle, weights_digest
-from asca_deploy.graph import Pipeline, StageTimes
 from asca_deploy.manifest import load_bundle
 from asca_deploy.ort_session import check_onnxruntime
 from asca_deploy.pillar.pipeline import PillarPipeline
+from asca_deploy.pipeline import Pipeline, StageTimes
 from asca_deploy.pv_rcnn.pipeline import PvRcnnPipeline
 from asca_deploy.scan_detections import ScanDetections
 from asca_deploy.shipped import find_bundle, sample_scan_path

@@ -3,12 +3,8 @@
 A manifest that does not belong to its graphs would move boxes without any error. So everything that boxes depend on
 is also in the metadata of each graph, under the graph's SHA-256, and the two have to agree.
 
-bundle.json as a file: reading its JSON, and checking that every value was taken as written.
-
-Checks of an ONNX file before a backend opens it, read without the package `onnx`.
-
-The file is a protobuf message (https://github.com/onnx/onnx/blob/main/onnx/onnx.proto); only the few fields below are
-read, others are skipped.
+Each graph is checked before a backend opens it, without the package `onnx`. The file is a protobuf message
+(https://github.com/onnx/onnx/blob/main/onnx/onnx.proto); only the few fields below are read, others are skipped.
 """
 
 import hashlib

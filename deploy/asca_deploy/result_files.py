@@ -28,9 +28,9 @@ from asca_pillars.base.own_files import (
     require_own,
     require_own_file,
 )
-from asca_pillars.data.boxes.box_split import labels_of_scan
 from asca_pillars.data.boxes.detector_scope import DetectorScope
 from asca_pillars.data.kitti import Calibration, calibration_of_scan, is_detection_text, read_calibration
+from asca_pillars.data.open_split import labels_of_scan
 from asca_pillars.geometry.overlap import bev_iou
 from asca_pillars.pictures.drawing import Image
 from asca_pillars.pictures.gallery_page import GalleryCard, gallery_page

@@ -6,13 +6,13 @@
 
 More scans per second are processed than one after the other, each with a little more latency.
 
-Queue of scans from a sensor's thread to a detector.
+`ScanQueue` brings scans from a sensor's thread to a detector:
 
-queue = ScanQueue(when_full="drop")
-lidar.on_scan = queue.put            # in the sensor's thread
-for detections in detector.stream(queue):
-    ...
-print(queue.dropped)
+    queue = ScanQueue(when_full="drop")
+    lidar.on_scan = queue.put            # in the sensor's thread
+    for detections in detector.stream(queue):
+        ...
+    print(queue.dropped)
 """
 
 import atexit

@@ -4,8 +4,6 @@ Each track is a Kalman filter over position and velocity on the ground, with whi
 Kirubarajan, Estimation with Applications to Tracking and Navigation, 6.3); x and y share one covariance, as motion and
 measurement are isotropic. The confidence of a track is a score that detections raise and time lowers (Benbarka et al.,
 Score refinement for confidence-based 3D multi-object tracking, IROS 2021).
-
-Result of tracking: the boxes of one scan with identities and velocities.
 """
 
 from collections.abc import Iterator, Mapping

@@ -11,10 +11,9 @@
 - The pseudo-image comes with the first convolution's padding in it, and may come in steps of its own: scale and offset
   of each channel go into that convolution's weights. Offsets are exact because nothing is padded after them.
 
-A sparse neck as dense convolutions with masks: the same function of a pseudo-image, with shapes that are fixed.
-
-Runtimes that want one shape for all scans (OpenVINO, TensorRT) and devices on which a dense convolution costs less than
-gathering take this form. Masks are maximum pools of which cells hold a pillar, by the rules of
+`MaskedBackbone` is a sparse neck as dense convolutions with masks: the same function of a pseudo-image, with shapes
+that are fixed. Runtimes that want one shape for all scans (OpenVINO, TensorRT) and devices on which a dense convolution
+costs less than gathering take this form. Masks are maximum pools of which cells hold a pillar, by the rules of
 `ops.pillar.neck_rulebooks`.
 """
 

@@ -1,7 +1,4 @@
-"""Quantization of a proven float bundle to 8 bits, with the differences measured.
-
-A backbone before and after its weights are rounded to 8 bits, and graphs in which any of its layers is rounded.
-"""
+"""Quantization of a proven float bundle to 8 bits, with the differences measured before and after rounding."""
 
 import copy
 import hashlib

@@ -4,16 +4,14 @@ A batch normalization is part of the weights before it. A convolution by table r
 so it is one product; an upsampling whose kernel equals its stride is one product for each active parent, whose
 outputs are then picked at head cells; the head's three convolutions are one product.
 
-Convolutions by table in ONNX: for each layer Concat (row of zeros), Gather, Reshape, Gemm, Relu.
+In ONNX a layer is Concat (row of zeros), Gather, Reshape, Gemm, Relu.
 
 In 8 bits all rows are uint8 from one Gemm to the next. Gemm stands between DequantizeLinear and QuantizeLinear, which
 runtimes join into one integer operator; the quantization's zero point is the ReLU.
 
-The sparse backbone in 8 bits, as `quantize` does it for the dense one; here no empty space has to be rounded.
-
-A channel's step is its largest value on the calibration scans / 255. Weights are rounded together (GPTQ), and the bias
-makes up for what rounding changes in the mean. The head's weights are rounded for the cells with the highest scores,
-which boxes are decoded from.
+Rounding is as in `quantize` for the dense neck; here no empty space has to be rounded. A channel's step is its largest
+value on the calibration scans / 255. Weights are rounded together (GPTQ), and the bias makes up for what rounding
+changes in the mean. The head's weights are rounded for the cells with the highest scores, which boxes are decoded from.
 """
 
 import copy

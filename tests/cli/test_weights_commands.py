@@ -9,7 +9,7 @@ from asca_deploy.manifest import load_bundle
 from asca_deploy.shipped import find_weights
 from asca_pillars.base.locks import recover
 from asca_pillars.models.build import load_checkpoint
-from asca_pillars.training import batch_norm
+from asca_pillars.training import average_weights
 from tests.helpers.in_process import run_here
 from tests.models.openpcdet.foreign_networks import PointPillars, write_foreign
 
@@ -46,7 +46,7 @@ def test_a_model_that_ships_and_a_checkpoint_are_averaged(tmp_path: Path) -> Non
 
 def test_another_command_in_the_folder_removes_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As `asca export` does, which begins by removing what killed writers left."""
-    monkeypatch.setattr(batch_norm, "update_batch_norm", lambda *_, **__: recover(tmp_path))
+    monkeypatch.setattr(average_weights, "update_batch_norm", lambda *_, **__: recover(tmp_path))
     out = tmp_path / "average.ckpt"
     done = run_here("average-weights", "default", "default", "-o", out, "--update-bn", tmp_path)
     assert done.returncode == 0, done.stderr

@@ -11,7 +11,7 @@ types of files hold records:
     *.json   one frame: {"boxes": [record, ...], ...}
     *.csv    a record in each row below a line of names; a column `scan` if it holds more than one frame
 
-Check that yaws are in radians; values that look like degrees are refused or reported.
+Yaws are in radians; values that look like degrees are refused or reported.
 """
 
 import csv

@@ -1,8 +1,6 @@
 """Frames imported from any source, and the dataset written from them (`data.boxes.box_split`).
 
-Scans are referenced, not copied.
-
-Validation of values from tables of other programs; invalid ones are counted and reported.
+Scans are referenced, not copied. Invalid values in tables of other programs are counted and reported.
 """
 
 import math

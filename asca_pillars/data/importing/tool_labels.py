@@ -1,7 +1,4 @@
-"""Common parts of the labelling tools' formats: one file per scan, matched by name, and safe writing of pre-labels.
-
-Import of CSV or JSON boxes (`data.boxes.box_records`), with their scans in a folder.
-"""
+"""Labels with one file per scan, matched by name: boxes as CSV or JSON, and what labelling tools' formats share."""
 
 import hashlib
 import json

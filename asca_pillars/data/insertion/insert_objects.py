@@ -11,8 +11,6 @@ Both sample as many objects, of the same classes and from the same database, so 
 Free ground is visible to the sensor (`free_space`), so nothing in the scan occludes such an object.
 Points that an inserted object occludes are removed: every point whose ray enters its box first. The paper does not
 state it; without it, walls would be visible through cars. Points of GT-Aug objects behind walls are kept, as in SECOND.
-
-Placement of an object in a frame, and occlusion by it (section 3.5, steps 5 and 6).
 """
 
 import itertools

@@ -1,7 +1,4 @@
-"""Problems of a dataset, found before training, each with its remedy.
-
-Configuration fitted to a dataset: classes with their anchors and thresholds, and ranges.
-"""
+"""Problems of a dataset, found before training, each with its remedy, and a configuration fitted to the dataset."""
 
 import math
 from collections import Counter

@@ -15,8 +15,7 @@ Errors are predicted minus label. Ends and sides are faces: positive means too f
 label's heading or its opposite, whichever points away from the sensor; the near end is the face where it enters. For an
 object seen side-on no end is nearer, for one seen end-on no side is; the names are then arbitrary.
 
-Surroundings of false positives: height, brightness, number of points, and points beside the box.
-
+A false positive is described by its surroundings: height, brightness, number of points, and points beside the box.
 Everything is measured on all points of the scan above the ground. A detection may
 have several traits or none. The traits are the same for every class, but have different causes: points above 2.3 m at a
 detected person indicate a post or a trunk, at a car a van, a wall or a hedge.

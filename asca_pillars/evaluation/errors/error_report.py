@@ -1,6 +1,6 @@
-"""Report of the error analysis: errors.json, errors.md and errors.html with sortable tables.
+"""Report of the error analysis: errors.json, errors.md and errors.html.
 
-Tables of the error analysis: datasets and their parts as rows for every group of objects.
+Its tables have datasets and their parts as rows for every group of objects; those of the page can be sorted.
 """
 
 import json

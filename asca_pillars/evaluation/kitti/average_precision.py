@@ -3,9 +3,9 @@
 Follows Geiger et al., "Are we ready for autonomous driving? The KITTI vision benchmark suite" (CVPR 2012), as the
 official C++ tool computes it, with its 41 samples of recall:
 
-- Ground truth and detections are counted, ignored or absent, per class and difficulty (`states`).
+- Ground truth and detections are counted, ignored or absent, per class and difficulty (`objects`).
 - They match at an IoU *above* 0.7 (Car) or 0.5 (others), in 2D, BEV and 3D alike. A box's location is its bottom.
-- Ground truth is processed in file order (`matching`). The first pass, by score, gives the scores at which recall is
+- Ground truth is processed in file order. The first pass, by score, gives the scores at which recall is
   nearest to 0, 1/40 ... 1; the second, by overlap, counts at each of these scores.
 - Counted detections that are not assigned are false positives; in 2D only, not if more than the same 0.7 or 0.5 of
   one is in a DontCare area. These areas have no 3D box, so detections in them are false in BEV and 3D.
@@ -16,12 +16,10 @@ official C++ tool computes it, with its 41 samples of recall:
 Results that the tool does not evaluate are absent rather than 0: a class in 2D unless a detection of it has x1 >= 0,
 in BEV unless one has x != -1000, in 3D unless one has y != -1000; AOS if any detection at all has alpha -10.
 
-KITTI's assignment of detections to ground truth, for all frames and all score thresholds at once.
-
-Ground truth is processed in file order; each object is matched to the best free detection. Within a frame this is
-sequential, but frames and thresholds are independent. So the first round matches the first object of every frame at
-every threshold, the next round the second ones; the number of rounds is the largest number of objects with a candidate
-in a frame.
+Detections are assigned for all frames and all score thresholds at once: each object is matched to the best free
+detection, which is sequential within a frame, but frames and thresholds are independent. So the first round matches the
+first object of every frame at every threshold, the next round the second ones; the number of rounds is the largest
+number of objects with a candidate in a frame.
 """
 
 from collections.abc import Iterator, Mapping, Sequence

@@ -1,6 +1,6 @@
-"""Report of KITTI's protocol: AP, AP by distance, recall and precision, as tables and as JSON.
+"""Report of KITTI's protocol: AP, AP by distance, recall and precision, as tables, as JSON and as a plot of curves.
 
-Plot of precision-recall curves; the only part of the evaluation that needs matplotlib.
+The plot is the only part of the evaluation that needs matplotlib.
 """
 
 from collections.abc import Iterator, Sequence

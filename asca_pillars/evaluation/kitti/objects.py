@@ -1,12 +1,10 @@
-"""Objects of a frame as arrays, for ground truth and detections alike.
+"""Objects of a frame as arrays, for ground truth and detections alike, and which of them count.
 
 Values are those of KITTI's text files, in the rectified camera frame (x right, y down, z forward) and in
 pixels of the left color image, because KITTI's protocol uses 2D boxes in addition to 3D ones.
 
-Objects that KITTI counts, ignores, or treats as absent, per class and difficulty.
-
-An ignored object need not be found, but can be matched; an ignored detection is never false, but can be matched. An
-absent one is neither.
+KITTI counts, ignores, or treats as absent each object, per class and difficulty. An ignored object need not be found,
+but can be matched; an ignored detection is never false, but can be matched. An absent one is neither.
 """
 
 from collections.abc import Mapping, Sequence

@@ -1,6 +1,9 @@
-"""Matching of objects and detections with at least a given score.
+"""Recall and precision at a fixed score, as for a detector run at its thresholds.
 
-An object is counted or, beyond a limit of the difficulty or of a neighboring type, ignored, as in KITTI (`states`).
+    recall = counted objects found / counted objects
+    precision = true positives / (true positives + false positives)
+
+An object is counted or, beyond a limit of the difficulty or of a neighboring type, ignored, as in KITTI (`objects`).
 Each reported detection, by descending score, is matched to the free object of its class, counted or ignored, with
 the largest overlap, if that is above the minimum. A matched object that is counted is found, and its detection is a
 true positive.
@@ -13,12 +16,7 @@ This differs from KITTI's AP, which ranks by score over the whole set: there eac
 object matched to a low detection (of any class) is neither found nor missed, DontCare areas apply in 2D only, and
 objects outside a distance band are ignored.
 
-Recall and precision at a fixed score, as for a detector run at its thresholds.
-
-    recall = counted objects found / counted objects
-    precision = true positives / (true positives + false positives)
-
-`score_threshold` defines counting and matching, and the differences to KITTI's AP. Recall in 3D at
+Recall in 3D at
 easy, moderate and hard is reported in Table 2 of AV PV-RCNN (2023), without a score. A distance band keeps the
 counted objects in it for the recall and the detections in it for the precision; it changes no match.
 """

@@ -1,7 +1,4 @@
-"""Report of tracking metrics over labelled sequences: HOTA, MOTA, identity switches, fragmentations.
-
-Evaluation of tracks written by `asca detect --track`.
-"""
+"""Evaluation of tracks over labelled sequences: HOTA, MOTA, identity switches, fragmentations."""
 
 import json
 from collections import Counter
@@ -17,8 +14,9 @@ from asca_pillars.base.errors import ConfigError, DatasetError
 from asca_pillars.base.files import read_text
 from asca_pillars.base.system import describe_environment
 from asca_pillars.data.boxes.box_records import NamedRecords
-from asca_pillars.data.boxes.box_split import BoxSplit, open_split
+from asca_pillars.data.boxes.box_split import BoxSplit
 from asca_pillars.data.boxes.detector_scope import DetectorScope
+from asca_pillars.data.open_split import open_split
 from asca_pillars.evaluation.arguments import Evaluation, EvaluationTask
 from asca_pillars.evaluation.boxes.box_predictions import predictions_by_frame, stated_scope
 from asca_pillars.evaluation.report_files import check_output_folder, write_report

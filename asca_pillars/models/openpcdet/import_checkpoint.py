@@ -17,7 +17,7 @@ from asca_pillars.config.tree import Config
 from asca_pillars.models.build import build_model
 from asca_pillars.models.checkpoint_file import read_failure, read_plain, write_plain
 from asca_pillars.models.openpcdet.key_mapping import KeyMapping, convert_state
-from asca_pillars.models.openpcdet.pv_rcnn_keys import (
+from asca_pillars.models.openpcdet.network_keys import (
     FIRST_CONVOLUTION,
     FIRST_LINEAR,
     FUSION,

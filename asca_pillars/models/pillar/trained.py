@@ -1,7 +1,4 @@
-"""A trained pillar detector that a setting names: a checkpoint, or the weights that a bundle holds.
-
-Training of a pillar detector by the outputs of a trained one, its teacher (arXiv 1503.02531).
-"""
+"""A trained pillar detector that a setting names, a first stage or a teacher (distillation, arXiv 1503.02531)."""
 
 import hashlib
 import json

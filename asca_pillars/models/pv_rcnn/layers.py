@@ -1,6 +1,6 @@
-"""Layers and network of PV-RCNN (arXiv 1912.13192).
+"""Layers and network of PV-RCNN (arXiv 1912.13192), and the extensions of its keypoint features.
 
-Extensions of PV-RCNN's keypoint features: adaptive scales (AFE-RCNN, 3.2) and adaptive deformation.
+These are adaptive scales (AFE-RCNN, 3.2) and adaptive deformation.
 """
 
 from collections.abc import Mapping, Sequence

@@ -1,6 +1,6 @@
 """The second stage: keypoints and their features, RoI-grid pooling, confidence and residuals (PV-RCNN, 3.2 to 3.4).
 
-Layers on point features: set abstraction (PointNet++) and VectorPool (PV-RCNN++, arXiv 2102.00463).
+Features of points are aggregated by set abstraction (PointNet++) or VectorPool (PV-RCNN++, arXiv 2102.00463).
 """
 
 import itertools

@@ -1,7 +1,4 @@
-"""Batches of the second stage from labelled frames.
-
-Proposals of a first stage for every frame of a split, computed once: the first stage is frozen meanwhile.
-"""
+"""Batches of the second stage from labelled frames, with proposals that the frozen first stage makes of each once."""
 
 import hashlib
 import json

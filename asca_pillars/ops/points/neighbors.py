@@ -2,10 +2,9 @@
 
 Index N, one past the last point, stands for nothing: callers append a row of zeros before gathering.
 
-Layouts of balls that graphs read faster than `ball_query`'s indices: gathered points, or groups of like size.
-
-A row of `ball_query` repeats its first point where the ball holds fewer. The maximum over a ball is the same without
-the repetitions; on the grids of proposals most of what the rows hold are repetitions.
+Graphs read gathered points, or groups of balls of like size, faster than `ball_query`'s indices. A row of `ball_query`
+repeats its first point where the ball holds fewer. The maximum over a ball is the same without the repetitions; on the
+grids of proposals most of what the rows hold are repetitions.
 """
 
 import math

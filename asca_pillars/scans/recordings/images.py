@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from asca_pillars.base.errors import ScanError
 from asca_pillars.scans.recordings.messages import decode_message, time_of
-from asca_pillars.scans.recordings.point_cloud2 import foxglove_image
+from asca_pillars.scans.recordings.point_clouds import foxglove_image
 from asca_pillars.scans.recordings.recording import Message, Recording, Topic, reason, topics_text
 
 ImageKind = Literal["Image", "CompressedImage", "Foxglove"]

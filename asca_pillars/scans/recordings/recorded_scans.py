@@ -1,7 +1,4 @@
-"""Scans of a recording's topic with time stamps, in order; unreadable ones are counted.
-
-Detection and opening of recordings.
-"""
+"""Opening of recordings, and the scans of a topic with time stamps, in order; unreadable ones are counted."""
 
 import shutil
 import weakref
@@ -21,9 +18,9 @@ from asca_pillars.scans.mounting import Mounting
 from asca_pillars.scans.recordings.decompression import UNPACKERS, decompress_file
 from asca_pillars.scans.recordings.mcap_files import McapRecording
 from asca_pillars.scans.recordings.packet_files import OusterPackets, PacketCapture
-from asca_pillars.scans.recordings.point_cloud2 import PointCloud, read_point_cloud
+from asca_pillars.scans.recordings.point_clouds import PointCloud, read_point_cloud
 from asca_pillars.scans.recordings.recording import Message, Recording, Topic, kind_of_scans
-from asca_pillars.scans.recordings.rosbag2 import (
+from asca_pillars.scans.recordings.ros_bags import (
     METADATA_FILE,
     BagMetadata,
     RosBag,

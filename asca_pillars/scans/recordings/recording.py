@@ -1,7 +1,4 @@
-"""Base class of recordings: topics, and the messages of one of them.
-
-Message types with a sensor's scans: supported ones, and how to convert recordings of the others.
-"""
+"""Base class of recordings: topics, their message types, and the messages of one of them."""
 
 import re
 from abc import ABC, abstractmethod

@@ -1,6 +1,6 @@
 """Geometric primitives of a scene: triangles, ellipsoids and limbs, with their surfaces.
 
-Random changes of shape, against overfitting to exact shapes: scale per axis, smooth warps, dark patches.
+Their shapes are changed at random, against overfitting to exact ones: scale per axis, smooth warps, dark patches.
 """
 
 from collections.abc import Sequence

@@ -1,8 +1,6 @@
 """Cars and vans as triangle meshes; lorries, buses, trams, trailers and caravans as boxes with wheels.
 
-x forward, wheels on z = 0.
-
-Body styles of cars and vans: their side views, their choice by size, and paint.
+x forward, wheels on z = 0. Cars and vans have body styles: side views, chosen by size, and paint.
 """
 
 from dataclasses import dataclass, replace

@@ -5,9 +5,7 @@ because every scene is used once. The ground is not meshed: each ray is marched 
 Random numbers (glass, foliage) belong to a firing and a primitive, so that casting fewer columns never changes
 the other returns.
 
-Rays against ellipsoids, solid ones and clouds of leaves (compiled by numba).
-
-Rays against triangles (compiled by numba): every ray in the window of rings and columns of each is tested.
+Ellipsoids are solid, or clouds of leaves. The loops are compiled by numba.
 """
 
 from typing import NamedTuple

@@ -1,6 +1,7 @@
-"""Statistics of scans: number of returns, their positions, fraction of ground, and reflectance.
+"""Statistics of scans and labels that the comparison with real ones reads.
 
-Statistics of labels: number, size, position, yaw and occlusion of objects, and the fit of boxes to points.
+Of scans: number of returns, their positions, fraction of ground, and reflectance. Of labels: number, size, position,
+yaw and occlusion of objects, and the fit of boxes to points.
 """
 
 from collections.abc import Mapping, Sequence

@@ -6,7 +6,7 @@ Random numbers per scan (calibration errors, thresholds) are drawn here; those p
 The scan is taken as if the car did not move: KITTI's scans are corrected for ego motion. Others do move during
 a scan, but the laser sweeps over one in some milliseconds, in which it moves less than its label box is loose.
 
-The Velodyne HDL-64E of KITTI: tables fitted to its scans that a data sheet does not give.
+The default is the Velodyne HDL-64E of KITTI, with tables fitted to its scans that a data sheet does not give.
 """
 
 from dataclasses import dataclass, fields

@@ -1,6 +1,6 @@
 """Labelled objects on their street: sizes by KITTI's statistics, and free positions.
 
-Positions of road users of each class on a street, standing or moving; u along it, v to its left.
+Each class has its habits, standing or moving; u runs along the street, v to its left.
 """
 
 from collections.abc import Callable

@@ -1,8 +1,6 @@
-"""Speed of several detectors in alternation, so that a busy machine slows all of them alike.
+"""Comparison of detectors: speed in alternation, so that a busy machine slows all alike, and differences of boxes.
 
-Differences between the boxes of two detectors.
-
-Comparison of providers, precisions and threads for a bundle on this machine.
+The matrix compares providers, precisions and threads for a bundle on this machine.
 """
 
 from collections.abc import Callable, Mapping, Sequence

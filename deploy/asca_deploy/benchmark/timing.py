@@ -1,13 +1,10 @@
 """Statistics of the benchmarks: percentiles of frames, spreads of ratios, rounds with a progress bar.
 
-Roofline of the backbone: its share of the arithmetic throughput of the machine.
+`throughput` counts scans per second of `Detector.stream`, and `scaling` times stages over the number of points.
 
-The ceiling is measured, not looked up: a product of two large matrices by onnxruntime's CPU provider with the same
-number of threads, one of them constant as a network's weights are. gemm_*.onnx come from benchmarks/gemm_graphs.py.
-
-Scans per second of `Detector.stream`, and its latency for a single scan.
-
-Time of each stage as a function of the number of points.
+The roofline is the backbone's share of the arithmetic throughput of the machine. Its ceiling is measured, not looked
+up: a product of two large matrices by onnxruntime's CPU provider with the same number of threads, one of them constant
+as a network's weights are. gemm_*.onnx come from benchmarks/gemm_graphs.py.
 """
 
 from collections.abc import Callable, Iterable, Sequence

@@ -1,7 +1,4 @@
-"""Inputs and outputs of the graphs of a pillar bundle, by name, and how they are opened.
-
-Interface of the pillar family's backbone graph, with a dense neck and with a sparse one.
-"""
+"""Inputs and outputs of the graphs of a pillar bundle, by name, and how they are opened."""
 
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol, TypeAlias

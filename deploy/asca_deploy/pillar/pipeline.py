@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from asca_deploy import providers
 from asca_deploy.bundle import BACKBONE, NECK, CanvasFormat, PillarBundle
-from asca_deploy.graph import Pipeline, Session, StageTimes, check_interface
+from asca_deploy.graph import Session, check_interface
 from asca_deploy.pillar.graphs import (
     PILLAR_FEATURES,
     HeadOutputs,
@@ -21,6 +21,7 @@ from asca_deploy.pillar.graphs import (
     open_encoder,
     output_channels,
 )
+from asca_deploy.pipeline import Pipeline, StageTimes
 from asca_pillars.base.kernels import load_kernels
 from asca_pillars.detection.decode import HeadMaps, decode
 from asca_pillars.detection.detections import Detections

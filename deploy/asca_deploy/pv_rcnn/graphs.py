@@ -1,7 +1,4 @@
-"""Inputs and outputs of the graphs of a pv_rcnn bundle, by name.
-
-Bird's-eye-view map of the voxels of the last level.
-"""
+"""Inputs and outputs of the graphs of a pv_rcnn bundle, by name, and the map between the first two."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any

@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from asca_deploy import providers
 from asca_deploy.bundle import BACKBONE, DEFORM, KEYPOINTS, REFINE, VOXELS, PvRcnnBundle
-from asca_deploy.graph import Interface, Pipeline, Session, StageTimes, check_interface
+from asca_deploy.graph import Interface, Session, check_interface
 from asca_deploy.pillar.pipeline import channels_first, run_graph, take_or_create
+from asca_deploy.pipeline import Pipeline, StageTimes
 from asca_deploy.pv_rcnn.graphs import (
     OUT,
     VoxelCanvas,

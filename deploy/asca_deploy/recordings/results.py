@@ -1,11 +1,10 @@
 """The files that `asca detect` makes of a recording: JSON lines, KITTI's tracking text, Foxglove, rerun.
 
-Journal of a recording's detections: lines that remain of a killed run and that the next one resumes from.
-
-The journal holds the detections of every scan, to the last bit; track identities and all output files are made from
-it at the end, atomically. So they are the same whether the run was killed or not. Its first line says what the results
-depend on; if that differs, the journal is begun anew. Every line has a digest (`base.files`): a truncated or damaged
-one is dropped, and its scan processed again.
+They are written from a journal, whose lines remain of a killed run and which the next one resumes from. The journal
+holds the detections of every scan, to the last bit; track identities and all output files are made from it at the end,
+atomically. So they are the same whether the run was killed or not. Its first line says what the results depend on; if
+that differs, the journal is begun anew. Every line has a digest (`base.files`): a truncated or damaged one is dropped,
+and its scan processed again.
 """
 
 import json

@@ -1,7 +1,4 @@
-"""Files of scans over time, of a recording or a folder: Foxglove, rerun, video.
-
-Videos of detections: a check before the work that one can be written, and that of a recording.
-"""
+"""Files of scans over time, of a recording or a folder: Foxglove, rerun, video."""
 
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack

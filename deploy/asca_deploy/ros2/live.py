@@ -19,7 +19,7 @@ from asca_deploy.tracker import Tracker, Tracks
 from asca_pillars.base.errors import AscaError, ConfigError, ScanError
 from asca_pillars.scans.ground_height import NamedPoints, estimate_named_height
 from asca_pillars.scans.mounting import Mounting
-from asca_pillars.scans.recordings.point_cloud2 import point_cloud_points
+from asca_pillars.scans.recordings.point_clouds import point_cloud_points
 from asca_pillars.scans.scan_reader import finite_scan, read_scan
 from asca_pillars.scans.scan_settings import (
     SAMPLE_SCANS,

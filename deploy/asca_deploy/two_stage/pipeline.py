@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 
 from asca_deploy import providers
 from asca_deploy.bundle import REFINE, PillarBundle, RefineSection
-from asca_deploy.graph import Interface, Pipeline, Session, StageTimes, Tensor, check_interface
+from asca_deploy.graph import Interface, Session, Tensor, check_interface
 from asca_deploy.pillar.pipeline import PillarPipeline, PreparedPillars, run_graph
+from asca_deploy.pipeline import Pipeline, StageTimes
 from asca_pillars.base.errors import BundleError
 from asca_pillars.base.kernels import load_kernels
 from asca_pillars.detection.detections import Detections

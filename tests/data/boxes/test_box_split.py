@@ -1,7 +1,4 @@
-"""The layout of boxes: what frames there are, what is in them, and that everything that trains reads it.
-
-Labels that lie beside a scan, in KITTI's layout and in a dataset with boxes.
-"""
+"""The layout of boxes: what frames there are, what is in them, and that everything that trains reads it."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -17,17 +14,17 @@ from asca_pillars.config.pillar import PillarModel
 from asca_pillars.config.tree import Config, DataConfig, InsertConfig, pillar_spec
 from asca_pillars.data.augment import open_frames
 from asca_pillars.data.boxes.box_records import json_line, read_frames, records_from
-from asca_pillars.data.boxes.box_split import BoxSplit, labels_of_scan, open_split
+from asca_pillars.data.boxes.box_split import BoxSplit
 from asca_pillars.data.frames import read_frame
 from asca_pillars.data.insertion.insert_objects import insert_objects, prepare_inserter
 from asca_pillars.data.inspection.findings import Finding, findings
 from asca_pillars.data.inspection.inspect_dataset import inspect_dataset
-from asca_pillars.data.kitti import KittiSplit
+from asca_pillars.data.open_split import open_split
 from asca_pillars.detection.anchors import ClassSpec
 from asca_pillars.scans.mounting import Mounting
 from asca_pillars.scans.scan_reader import read_scan, write_scan
 from tests.data.boxes.box_scenes import write_box_dataset
-from tests.helpers.scenes import SPEC, make_scene, write_dataset
+from tests.helpers.scenes import SPEC, make_scene
 
 CLASSES = (SPEC.classes[0], ClassSpec("Forklift", 0.8, 0.6, 1.73, -0.87, 0.35, 0.2))
 CONFIG = Config(model=PillarModel(spec=replace(SPEC, classes=CLASSES)), data=DataConfig(workers=0))
@@ -224,28 +221,3 @@ def test_a_wrong_file_of_labels_is_named(root: Path) -> None:
         with pytest.raises(DatasetError, match=message):
             frame_ids(root, "labels: labels\n")
         (root / "labels" / name).unlink()
-
-
-def test_kitti(tmp_path: Path) -> None:
-    split = KittiSplit(write_dataset(tmp_path / "kitti", 1))
-    scan, label = split.scan_path("000000"), split.label_path("000000")
-    boxes = labels_of_scan(scan)
-    assert boxes is not None and len(boxes)
-    np.testing.assert_array_equal(boxes, split.labeled_boxes("000000").boxes)
-    label.write_text("damaged")
-    with pytest.raises(DatasetError, match=r"000000\.txt:1"):
-        labels_of_scan(scan)
-    label.unlink()
-    assert labels_of_scan(scan) is labels_of_scan(tmp_path / "scan.bin") is None
-
-
-def test_boxes_are_in_the_frame_of_the_scan(tmp_path: Path) -> None:
-    root = write_box_dataset(tmp_path / "own", 2)
-    (root / "dataset.yaml").write_text("{axes: y-forward, labels: labels.jsonl}\n")
-    box = [[-3, 12, -1, 4, 2, 1.5, 1.2]]
-    (root / "labels.jsonl").write_text(json_line("000000.bin", records_from(np.array(box), ["Car"])))
-    boxes = labels_of_scan(root / "scans" / "000000.bin")
-    assert boxes is not None
-    np.testing.assert_allclose(boxes, box, atol=1e-4)
-    assert labels_of_scan(root / "scans" / "000001.bin") is None  # without a line
-    assert labels_of_scan(tmp_path / "own" / "elsewhere.bin") is None  # not one of its scans

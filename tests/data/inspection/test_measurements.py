@@ -9,11 +9,11 @@ import pytest
 
 from asca_pillars.config.tree import DataConfig
 from asca_pillars.data.boxes.box_records import json_line, read_frames, records_from
-from asca_pillars.data.boxes.box_split import open_split
 from asca_pillars.data.inspection.findings import findings
 from asca_pillars.data.inspection.inspect_dataset import inspect_dataset
 from asca_pillars.data.inspection.measurements import CONVENTIONS, better_convention, convention_fits, count_points
 from asca_pillars.data.kitti import KittiSplit
+from asca_pillars.data.open_split import open_split
 from asca_pillars.geometry.boxes import points_in_boxes
 from tests.data.boxes.box_scenes import write_box_dataset
 from tests.helpers.in_process import invoke

@@ -12,7 +12,7 @@ pytest.importorskip("rosbags", reason="needs pip install -e '.[recordings]'")
 from rosbags.typesys import get_types_from_msg
 
 from asca_pillars.base.errors import ScanError
-from asca_pillars.scans.recordings.point_cloud2 import PointCloud, read_point_cloud
+from asca_pillars.scans.recordings.point_clouds import PointCloud, read_point_cloud
 from asca_pillars.scans.recordings.recording import Encoding, Message, ScanKind, kind_of_scans
 from tests.scans.recordings.cloud_recordings import START_NS, cloud_points, header, serialized, store
 

@@ -18,7 +18,7 @@ pytest.importorskip("ouster.sdk", reason="needs pip install -e '.[packets]'")
 from asca_pillars.base.errors import ScanError
 from asca_pillars.scans.recordings.messages import typestore
 from asca_pillars.scans.recordings.packet_files import PacketCapture
-from asca_pillars.scans.recordings.point_cloud2 import read_point_cloud
+from asca_pillars.scans.recordings.point_clouds import read_point_cloud
 from asca_pillars.scans.recordings.recorded_scans import RecordedScan, RecordedScans, is_recording, open_recording
 from asca_pillars.scans.recordings.recording import Encoding, Message, Recording, Topic, kind_of_scans
 

@@ -1,6 +1,6 @@
-"""Statistics of batch normalization, computed anew where those of a checkpoint do not fit its weights.
+"""Average of the weights of several checkpoints of one network, and statistics of batch normalization for it.
 
-Average of the weights of several checkpoints of one network.
+Those of the checkpoints do not fit the averaged weights, so they can be computed anew.
 """
 
 from collections.abc import Iterator, Sequence

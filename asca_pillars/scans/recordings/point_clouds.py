@@ -1,8 +1,7 @@
-"""ROS' sensor_msgs/PointCloud2: points of any field layout, byte order and padding.
+"""Messages with points: sensor_msgs/PointCloud2 of any field layout, byte order and padding, and other types.
 
-Messages of other types: sensor_msgs/PointCloud, Livox' CustomMsg, foxglove.PointCloud and CompressedImage.
-
-The layouts are those of their public definitions (common_interfaces, livox_ros_driver2, foxglove/schemas).
+These are sensor_msgs/PointCloud, Livox' CustomMsg, foxglove.PointCloud and CompressedImage, with the layouts of their
+public definitions (common_interfaces, livox_ros_driver2, foxglove/schemas).
 """
 
 import base64

@@ -1,21 +1,18 @@
-"""OpenPCDet's PV-RCNN as ours: other names, and other orders of channels where they are joined.
+"""Networks of OpenPCDet and mmdetection3d as ours: other names, and other orders of channels where they are joined.
 
-Theirs joins a keypoint's features as map, raw points, conv1 to conv4, ours as `settings.sources` and the map; a channel
-of their map is channel * height + z, of ours z * channels + channel; their pooled grid is channel-major, ours has the
-channels of a grid point side by side.
+PV-RCNN: theirs joins a keypoint's features as map, raw points, conv1 to conv4, ours as `settings.sources` and the map;
+a channel of their map is channel * height + z, of ours z * channels + channel; their pooled grid is channel-major, ours
+has the channels of a grid point side by side.
 
-The PointPillars of OpenPCDet, and the first layer of mmdetection3d's, as ours.
-
-Their points have a tenth feature, the height above the pillar's center. All pillars have the same center height, so the
-feature is z less a constant: its weight joins that of z, and the constant joins the mean of the normalization. An empty
-slot has zeros in all ten, the height of the center included, and so it keeps its own value before the normalization.
+PointPillars: their points have a tenth feature, the height above the pillar's center. All pillars have the same center
+height, so the feature is z less a constant: its weight joins that of z, and the constant joins the mean of the
+normalization. An empty slot has zeros in all ten, the height of the center included, and so it keeps its own value
+before the normalization.
 
 In mmdetection3d (`legacy`) the offsets to the pillar's center also take the place of x, y and z: their weights join.
 
-mmdetection3d's PointPillars and PV-RCNN as ours: the networks of OpenPCDet under other names.
-
-Their convolutions of a second stage and of set abstraction are modules with a `conv` and a `bn`, where OpenPCDet counts
-layers; the layouts of the arrays are the same.
+mmdetection3d has the networks of OpenPCDet under other names. Its convolutions of a second stage and of set abstraction
+are modules with a `conv` and a `bn`, where OpenPCDet counts layers; the layouts of the arrays are the same.
 """
 
 import re

@@ -1,8 +1,6 @@
-"""Folders of rosbag2: a recording in several consecutive files, and its metadata.yaml.
+"""ROS bags: of ROS 1, and rosbag2's folders and SQLite files; a damaged message, row or chunk is skipped.
 
-SQLite files of rosbag2, read row by row; a row that cannot be read loses only its message.
-
-ROS 1 bags, read with the library rosbags; damaged chunks and messages are skipped.
+ROS 1 bags are read with the library rosbags.
 """
 
 import heapq

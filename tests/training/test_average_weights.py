@@ -12,7 +12,7 @@ from asca_pillars.base.progress import Reporter
 from asca_pillars.config.pillar import NetworkConfig, PillarModel
 from asca_pillars.config.tree import Config, DataConfig
 from asca_pillars.models.build import Checkpoint, build_model, load_checkpoint
-from asca_pillars.training.batch_norm import BATCH_FRAMES, average_checkpoints, update_batch_norm
+from asca_pillars.training.average_weights import BATCH_FRAMES, average_checkpoints, update_batch_norm
 from asca_pillars.training.dataset import open_dataset
 from tests.helpers.saved_checkpoint import save_checkpoint
 from tests.helpers.scenes import SPEC, write_dataset

@@ -9,7 +9,7 @@ import pytest
 pytest.importorskip("rosbags", reason="needs pip install -e '.[recordings]'")
 
 from asca_pillars.base.errors import ScanError
-from asca_pillars.scans.recordings.point_cloud2 import PointCloud, read_point_cloud
+from asca_pillars.scans.recordings.point_clouds import PointCloud, read_point_cloud
 from asca_pillars.scans.recordings.recording import Message
 from benchmarks.made_recordings import point_cloud2
 from tests.scans.recordings.cloud_recordings import CLOUD, START_NS, cloud_points, laid_out, serialized, store
