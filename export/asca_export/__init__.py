@@ -1,3 +1,3 @@
 """Export of a checkpoint to a bundle: ONNX graphs, parity with PyTorch, 8-bit quantization."""
 
-import asca_deploy.onnx_runtime  # noqa: F401  (`rounded_backbones` imports its tools after it)
+import asca_deploy.onnx_runtime  # noqa: F401  (`int8` imports its tools after it)

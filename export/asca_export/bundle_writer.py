@@ -41,7 +41,7 @@ class ExportOptions:
         command: the command that trained them.
         calibration: scans (N, 4), metres, LiDAR frame, and reflectance, that set the ranges of an 8-bit bundle; those
             that parity is proven on are left out and counted. None exports in float32.
-        dense_neck: write a sparse neck as dense convolutions with masks, in float32 alone, see `pillar.masked_forms`.
+        dense_neck: write a sparse neck as dense convolutions with masks, in float32 alone, see `fast_forms`.
         weights: the checkpoint's file, whose weights are to lie beside the graphs in 16 bits; None leaves them out.
         progress: called with a description of each step.
     """

@@ -81,7 +81,7 @@ def test_a_bundle_is_not_compared_with_itself(tiny_bundle: Path, monkeypatch: py
 def test_what_cannot_work_is_told_before_the_work(
     tiny_bundle: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("asca_pillars.cli.bench.benchmark", lambda *_, **__: pytest.fail("too late"))
+    monkeypatch.setattr("asca_pillars.cli.bench_parts.benchmark", lambda *_, **__: pytest.fail("too late"))
     with pytest.raises(BundleError, match="none: no such folder"):
         invoke("bench", "-b", tiny_bundle, "--compare", tmp_path / "none")
     with pytest.raises(OutputError, match="is a folder"):

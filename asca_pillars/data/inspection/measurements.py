@@ -209,7 +209,7 @@ class FrameMeasure(NamedTuple):
 
     `boxes` (M, 7), `labels` (M,) class index, `points` (M,) inside each box, `outcomes` (M,), `positives` (C,) positive
     anchors of each class, `axes` a warning about the scan's axes, `convention_points` (C, M) inside each box by each
-    of the `box_conventions`, `label_yaws` as labelled.
+    of the conventions, `label_yaws` as labelled.
     """
 
     types: Counter[str]

@@ -210,7 +210,7 @@ def group_balls(indices: NDArray[np.int32], count: int) -> GroupedBalls[NDArray[
     samples = indices.shape[1]
     widths = group_widths(samples)
     # The first point, and what repeats it. Other sums along so short an axis take three times as long, and a matrix
-    # product wakes BLAS threads (`geometry.rotations`).
+    # product wakes BLAS threads (`geometry.frame_change`).
     first = np.einsum("ij->i", (indices == indices[:, :1]).astype(np.float32))
     group = np.searchsorted(np.array(widths, np.float32), samples + 1 - first).astype(np.uint8)
     order = np.argsort(group, kind="stable").astype(np.int32)
