@@ -70,6 +70,8 @@ def measure_parts(
     lines = summary_lines(report)
     if not all(report.points_inside):
         lines.append("no roofline: the backbone has nothing to compute in a scan without points in the model's ranges")
+    elif detector.view == "around" and detector.passes == 1:
+        lines.append("no roofline: the bundle counts the backbone's operations in its own ranges, not all around")
     elif detector.provider in ON_THE_CPU:
         # The stage includes all passes of a scan, the backbone's operations are those of one pass.
         pass_ms = report.stages_ms["neck+head"].p50 / detector.passes

@@ -116,3 +116,8 @@ def test_of_many_scans_some_are_timed(
     output = invoke("bench", tmp_path / "scans", *options)
     assert "timing 3 of the 7 scans, evenly spaced" in output and "3 scan(s)" in output
     assert json.loads((tmp_path / "report.json").read_text())["points"] == [1000, 997, 994]
+
+
+def test_in_wider_ranges_there_is_no_roofline() -> None:
+    output = invoke("bench", "-b", "fast", "--around", "--rounds", 1)
+    assert "no roofline" in output and "GMAC/s" not in output
