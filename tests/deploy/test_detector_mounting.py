@@ -17,7 +17,7 @@ from asca_pillars.scans.ground_height import fit_ground_plane
 from asca_pillars.scans.mounting import Mounting
 from asca_pillars.scans.scan_reader import read_scan
 from tests.deploy.conftest import EXPECTED_INPUT, SPEC, make_scan, write_bundle
-from tests.helpers.bundles import DENSE_FLOAT32
+from tests.helpers.bundles import DENSE_FLOAT32, DENSE_INT8
 
 Points = NDArray[np.float32]
 TRAINED_M = 1.75  # the middle of EXPECTED_INPUT.ground_z_m
@@ -121,7 +121,7 @@ def test_a_car_on_a_seam_is_found_once() -> None:
     """The sample turned so that each of its clearest cars stands between two passes, and a little to either side."""
     points = read_scan(sample_scan_path()).points
     # Below the model's threshold: it is unsure of cars that stand slantwise, but never sees one in both passes.
-    detector = Detector("accurate", view="around", score_threshold=0.3)
+    detector = Detector(DENSE_INT8, view="around", score_threshold=0.3)
     assert detector.passes == 4
     found = detector(points)
     cars = found[(found.labels == 0) & (found.distances_m < 25)][:3]
