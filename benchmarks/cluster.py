@@ -35,7 +35,7 @@ from asca_deploy.detect_archive import DetectShard, bundle_digest
 from asca_deploy.open_model import RuntimeOptions
 from asca_pillars.base.files import write_json
 from asca_pillars.cli.run_command import run_command
-from asca_pillars.cluster.shards import make_shards
+from asca_pillars.cluster import make_shards
 from asca_pillars.scans.mounting import Mounting
 from asca_pillars.scans.scan_reader import write_scan
 from tests.deploy.conftest import make_scan, write_bundle

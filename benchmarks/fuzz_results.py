@@ -22,7 +22,7 @@ from asca_pillars.base.files import require_writable
 from asca_pillars.base.own_files import page_end
 from asca_pillars.base.settings import to_dict
 from asca_pillars.base.system import describe_environment
-from asca_pillars.cluster.shards import Shard, ShardFolder
+from asca_pillars.cluster import Shard, ShardFolder
 from asca_pillars.config.tree import Config, load_config
 from asca_pillars.data.boxes.box_split import BoxSplit
 from asca_pillars.data.boxes.detector_scope import DetectorScope
@@ -30,7 +30,7 @@ from asca_pillars.data.importing.imported import MARKER, require_own_dataset
 from asca_pillars.data.kitti import write_image_set
 from asca_pillars.evaluation import report_files as eval_files
 from asca_pillars.evaluation.boxes.box_predictions import read_box_predictions
-from asca_pillars.evaluation.tracking.tracking_report import tracking_report
+from asca_pillars.evaluation.tracking_report import tracking_report
 from asca_pillars.pictures.visualize import png_bytes
 from asca_pillars.scans.scan_reader import read_scan, write_scan
 from asca_pillars.sim.simulation import require_own_frames

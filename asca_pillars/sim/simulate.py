@@ -66,7 +66,7 @@ def simulate(
         raise ConfigError(f"--length {length} is for drives: give --sequences N, too, or --frames N for single scans")
     if sequences is not None and (frames is not None or cluster is not None):
         raise ConfigError("--sequences: leave --frames and --cluster out; they are for single scans")
-    from asca_pillars.sim.sequences.sequence_files import require_own_sequences, simulate_sequences
+    from asca_pillars.sim.sequence_files import require_own_sequences, simulate_sequences
     from asca_pillars.sim.simulation import load_simulation_config, require_own_frames
     from asca_pillars.sim.simulation import simulate as write_frames
 

@@ -18,7 +18,7 @@ from asca_pillars.base.processes import map_in_processes
 from asca_pillars.base.progress import Reporter
 from asca_pillars.base.settings import parse, read_settings, shipped_configs
 from asca_pillars.base.strict import Strict
-from asca_pillars.cluster.run_shards import run_items
+from asca_pillars.cluster import run_items
 from asca_pillars.data.kitti import (
     Calibration,
     KittiObject,
@@ -33,9 +33,9 @@ from asca_pillars.data.kitti.kitti_split import SIMULATION_FILE
 from asca_pillars.scans.scan_reader import write_scan
 from asca_pillars.sim.annotation import label_all_around, label_camera_view
 from asca_pillars.sim.casting.raycast import Hits, cast
+from asca_pillars.sim.lidar import Firings, Lidar, draw_firings
+from asca_pillars.sim.returns import Returns, measure
 from asca_pillars.sim.scene_config import SceneConfig
-from asca_pillars.sim.sensor.lidar import Firings, Lidar, draw_firings
-from asca_pillars.sim.sensor.returns import Returns, measure
 from asca_pillars.sim.world.scene import Scene, build, draw_scene
 from asca_pillars.sim.world.streets import draws_of
 

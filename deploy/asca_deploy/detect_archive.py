@@ -32,8 +32,7 @@ from asca_pillars.base.own_files import json_object, require_own
 from asca_pillars.base.progress import Progress, Remark, Reporter
 from asca_pillars.base.settings import to_dict
 from asca_pillars.base.system import package_versions
-from asca_pillars.cluster.run_shards import run_shards
-from asca_pillars.cluster.shards import RUN_SETTINGS, Shard, ShardFolder, make_shards
+from asca_pillars.cluster import RUN_SETTINGS, Shard, ShardFolder, make_shards, run_shards
 from asca_pillars.data.boxes.detector_scope import detector_scope
 from asca_pillars.detection.spec import ScoreThresholds
 from asca_pillars.scans.mounting import Mounting

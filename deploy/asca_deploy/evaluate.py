@@ -101,7 +101,7 @@ def evaluate(
         return open_model(options, min_score, sensor_height_m=sensor_height_m, around=around)
 
     if chosen == "tracking":
-        from asca_pillars.evaluation.tracking.tracking_report import evaluate_tracks
+        from asca_pillars.evaluation.tracking_report import evaluate_tracks
 
         done = evaluate_tracks(task)
     elif chosen == "iou" or chosen == "distance":

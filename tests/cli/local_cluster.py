@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
-from asca_pillars.cluster.shards import Outcome, Shard
+from asca_pillars.cluster import Outcome, Shard
 
 
 class Here:

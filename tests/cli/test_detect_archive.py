@@ -17,7 +17,7 @@ from asca_pillars.base import installation
 from asca_pillars.base.errors import AscaError, BundleError, ClusterError, ConfigError, OutputError, ScanError
 from asca_pillars.base.installation import install_command
 from asca_pillars.cli.detect import detect
-from asca_pillars.cluster.shards import Outcome, Shard
+from asca_pillars.cluster import Outcome, Shard
 from asca_pillars.scans.scan_reader import read_scan, write_scan
 from tests.cli.local_cluster import Here
 from tests.deploy.conftest import make_scan, write_bundle

@@ -20,8 +20,8 @@ from asca_pillars.models.build import ScanDetector, build_model, load_checkpoint
 from asca_pillars.models.two_stage.first_stage import open_first_stage, with_first_stage
 from asca_pillars.models.two_stage.network import RefineDetector, refine
 from asca_pillars.models.two_stage.preparation import LabeledProposals, move_proposed
+from asca_pillars.ops.two_stage.decode import match_proposals
 from asca_pillars.ops.two_stage.first_stage import run_first_stage
-from asca_pillars.ops.two_stage.rois import match_proposals
 from asca_pillars.training.dataset import Batch, Collate, open_dataset
 from asca_pillars.training.loop import train
 from tests.helpers.scenes import SPEC, write_dataset

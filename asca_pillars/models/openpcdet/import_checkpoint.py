@@ -16,11 +16,12 @@ from asca_pillars.config.pv_rcnn import PvRcnnModel
 from asca_pillars.config.tree import Config
 from asca_pillars.models.build import build_model
 from asca_pillars.models.checkpoint_file import read_failure, read_plain, write_plain
-from asca_pillars.models.openpcdet.key_mapping import KeyMapping, convert_state
 from asca_pillars.models.openpcdet.network_keys import (
     FIRST_CONVOLUTION,
     FIRST_LINEAR,
     FUSION,
+    KeyMapping,
+    convert_state,
     mmdetection3d_keys,
     pointpillars_keys,
     pv_rcnn_keys,

@@ -21,9 +21,8 @@ from asca_pillars.models.trainable import Trainable
 from asca_pillars.models.two_stage.layers import Refinements, zero_of_weights
 from asca_pillars.models.two_stage.loss import RefineTargets, distance_iou_loss, refine_loss
 from asca_pillars.ops.sparse.rulebooks import stack_rows
-from asca_pillars.ops.two_stage.decode import reported_frames
+from asca_pillars.ops.two_stage.decode import match_proposals, reported_frames, roi_targets, sample_rois
 from asca_pillars.ops.two_stage.prepare import grid_neighbors
-from asca_pillars.ops.two_stage.rois import match_proposals, roi_targets, sample_rois
 
 _DISTANCE_IOU_WEIGHT = 0.3  # alpha of AFE-RCNN's eq. (14)
 

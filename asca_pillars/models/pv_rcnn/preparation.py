@@ -19,7 +19,7 @@ from asca_pillars.ops.pv_rcnn.prepare import VoxelScan, VoxelSetSettings, voxel_
 from asca_pillars.ops.pv_rcnn.rulebooks import VoxelLevel, stack_voxel_levels
 from asca_pillars.ops.pv_rcnn.spec import VoxelSpec
 from asca_pillars.ops.sparse.rulebooks import stack_cells, stack_rows
-from asca_pillars.ops.two_stage.rois import keypoint_states
+from asca_pillars.ops.two_stage.decode import keypoint_states
 
 Array = TypeVar("Array")
 

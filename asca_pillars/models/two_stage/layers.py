@@ -328,7 +328,7 @@ class Refinements(NamedTuple):
     confidence: Tensor
     """(R,) logits."""
     residuals: Tensor
-    """(R, 7), see `ops.two_stage.rois`."""
+    """(R, 7), see `ops.two_stage.decode`."""
     keypoint_logits: Tensor
     """(K,) of a keypoint's being part of an object."""
 

@@ -98,7 +98,7 @@ def distance_iou_loss(residuals: Tensor, targets: Tensor, sizes: Tensor) -> Tens
 def corners_in_frames(residuals: Tensor, sizes: Tensor) -> Tensor:
     """Return corners of refined boxes, seen from their proposals of these sizes: (R, 7), (R, 3) -> (R, 8, 3) metres.
 
-    The order is that of `geometry.boxes.corners`; residuals as in `ops.two_stage.rois`.
+    The order is that of `geometry.boxes.corners`; residuals as in `ops.two_stage.decode`.
     """
     center, half = _boxes_in_frames(residuals, sizes)
     signs = half.new_tensor([[1, 1], [-1, 1], [-1, -1], [1, -1]]).tile(2, 1)  # (8, 2)

@@ -27,9 +27,7 @@ from asca_pillars.detection.detections import Detections
 from asca_pillars.models.two_stage.first_stage import open_first_stage, with_first_stage
 from asca_pillars.models.two_stage.layers import RefineInputs
 from asca_pillars.models.two_stage.loss import RefineTargets
-from asca_pillars.ops.two_stage.first_stage import FirstStage, FirstStageSettings, SecondStageInputs, run_first_stage
-from asca_pillars.ops.two_stage.prepare import RefineScan, RefineSettings, refine_scan
-from asca_pillars.ops.two_stage.rois import (
+from asca_pillars.ops.two_stage.decode import (
     Overlaps,
     RoiTargets,
     keypoint_states,
@@ -37,6 +35,8 @@ from asca_pillars.ops.two_stage.rois import (
     roi_targets,
     sample_rois,
 )
+from asca_pillars.ops.two_stage.first_stage import FirstStage, FirstStageSettings, SecondStageInputs, run_first_stage
+from asca_pillars.ops.two_stage.prepare import RefineScan, RefineSettings, refine_scan
 
 _FORMAT = 3  # format of the files; with another number, old ones are not read
 

@@ -13,8 +13,8 @@ from asca_pillars.base.strict import Strict
 from asca_pillars.detection.detections import Detections
 from asca_pillars.ops.points.neighbors import ball_query, nearest_in_cubes
 from asca_pillars.ops.points.sampling import points_near_boxes
+from asca_pillars.ops.two_stage.decode import roi_grid_points
 from asca_pillars.ops.two_stage.first_stage import SecondStageInputs
-from asca_pillars.ops.two_stage.rois import roi_grid_points
 
 ROI_FEATURES = 4
 """Columns of `roi_features` besides the one-hot class."""

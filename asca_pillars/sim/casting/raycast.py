@@ -33,7 +33,7 @@ from asca_pillars.sim.casting.rays import (
     rings_of,
     window_of,
 )
-from asca_pillars.sim.sensor.lidar import Firings
+from asca_pillars.sim.lidar import Firings
 from asca_pillars.sim.world.ground import Ground
 
 TUFT_M = 0.2

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from asca_pillars.base.compiling import cached
 from asca_pillars.geometry.arrays import Floats, Ints, Mask, Singles
-from asca_pillars.sim.sensor.lidar import Firings
+from asca_pillars.sim.lidar import Firings
 
 NOTHING = -3  # owner of a firing without a hit
 _BEYOND_RAD = 0.02  # columns are cast slightly beyond the wedge: ring phases turn them by up to one firing

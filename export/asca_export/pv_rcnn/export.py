@@ -1,25 +1,109 @@
-"""Export of a PV-RCNN checkpoint to a bundle."""
+"""Export of a PV-RCNN checkpoint to a bundle.
+
+Parity with the trained model is proven graph by graph on the same inputs, then of the boxes.
+"""
 
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from asca_deploy.bundle import BACKBONE, BUNDLE_FOLDER, Parity, PvRcnnBundle, PvRcnnSection
+from asca_deploy.pv_rcnn.graphs import OUT, VoxelCanvas, balls_around
 from asca_deploy.pv_rcnn.pipeline import PvRcnnPipeline
 from asca_export import graphs
 from asca_export.bundle_writer import DEFAULTS, ExportOptions, draft_bundle, require_parity_scans, write_bundle
 from asca_export.int8 import calibration_scans
+from asca_export.parity import require_close, require_compared, require_same_refined
 from asca_export.pv_rcnn.graphs import export_pv_rcnn_graphs
 from asca_export.pv_rcnn.int8 import quantize_pv_rcnn_bundle, require_quantizable
-from asca_export.pv_rcnn.parity import check_pv_rcnn_parity
 from asca_pillars.base.files import atomic_directory
 from asca_pillars.base.system import default_threads
 from asca_pillars.config.pv_rcnn import PvRcnnModel
+from asca_pillars.detection.decode import HeadMaps
+from asca_pillars.detection.proposals import propose_anchors
 from asca_pillars.models.build import Checkpoint
+from asca_pillars.models.pv_rcnn.layers import PvRcnn
 from asca_pillars.models.pv_rcnn.network import PvRcnnDetector
+from asca_pillars.models.pv_rcnn.preparation import VoxelBatch, batch_scans
+from asca_pillars.ops.points.sampling import read_map
+from asca_pillars.ops.pv_rcnn.prepare import LEVEL_SOURCES, voxel_scan
+from asca_pillars.ops.two_stage.prepare import grid_neighbors
+
+RELATIVE_TOLERANCE = 1e-4  # of a graph's outputs, relative to their largest value where that is above 1
+
+Array = NDArray[np.float32]
+
+
+def check_pv_rcnn_parity(network: PvRcnn, runtime: PvRcnnPipeline, scans: Sequence[Array]) -> Parity:
+    """Compare every stage in PyTorch with the exported graph on what PyTorch gave for the stage before.
+
+    A proposal that one side has and the other lacks, by a tie between scores, would hide what a graph does.
+
+    Args:
+        network: in evaluation mode.
+        runtime: opened on the bundle.
+        scans: (N, 4) each, at least one of them with points in the ranges.
+
+    Raises:
+        ExportError: they differ; names the first stage that does, and the scan.
+    """
+    worst = worst_box = worst_yaw = 0.0
+    spec, builder, compared = network.spec, network.spec.rulebook_builder(), 0
+    for number, points in enumerate(scans):
+        scan = voxel_scan(points[np.isfinite(points).all(axis=1)], spec, network.settings, builder)
+        if not len(scan.features):
+            continue
+        compared += 1
+        batch = batch_scans([scan], spec)
+        with torch.inference_mode():
+            first = network.propose(batch)
+            described, _ = network.encode_keypoints(batch, first.levels, first.canvas)
+        levels = dict(zip((*LEVEL_SOURCES, OUT), (level.numpy() for level in first.levels), strict=True))
+        for name, found in runtime.encode(scan).items():
+            worst = max(worst, _require(f"voxels `{name}`", levels[name], found, number))
+        canvas = VoxelCanvas(spec.level_shapes[-1], first.canvas.shape[3])
+        canvas.scatter(levels[OUT], scan.levels[-1].cells)
+        worst = max(worst, _require("scatter", first.canvas.numpy(), canvas.image, number))
+        maps = HeadMaps(*(part[0].numpy() for part in first.maps))
+        for name, wanted, found in zip(maps._fields, maps, runtime.neck_and_head(canvas.image), strict=True):
+            worst = max(worst, _require(f"head `{name}`", wanted, found, number))
+        bev = read_map(canvas.rows, scan.bev_cells, scan.bev_weights)
+        features = described.numpy()
+        places = _places(network, batch, first.levels)
+        for name, found in runtime.deform(scan, levels).items():
+            worst = max(worst, _require(f"deform `{name}`", places[name], found, number))
+        # PyTorch's places for both sides: the last bit of one decides which voxels lie in its ball.
+        found = runtime.encode_keypoints(scan, levels, bev, places, balls_around(scan, network.settings, places))
+        worst = max(worst, _require("keypoints", features, found, number))
+        proposals = propose_anchors(maps, spec, network.settings.proposals)
+        grid = grid_neighbors(scan.keypoints, proposals.boxes, network.settings, network.settings.vector_cells)
+        with torch.inference_mode():
+            indices = [torch.from_numpy(part) for part in grid.indices]
+            refined = network.refine(batch.keypoints, described, torch.from_numpy(grid.points), indices)
+        ours = refined[0].numpy(), refined[1].numpy()
+        theirs = runtime.refine(scan.keypoints, features, grid)
+        for name, wanted, found in zip(("confidence", "residuals"), ours, theirs, strict=True):
+            worst = max(worst, _require(f"refine `{name}`", wanted, found, number))
+        difference = require_same_refined(proposals, ours, theirs, spec, runtime.scores, number)
+        worst_box, worst_yaw = max(worst_box, difference.center_size_m), max(worst_yaw, difference.yaw_rad)
+    return Parity(worst, worst_box, worst_yaw, require_compared(compared), RELATIVE_TOLERANCE)
+
+
+def _places(network: PvRcnn, batch: VoxelBatch[torch.Tensor], levels: Sequence[torch.Tensor]) -> dict[str, Array]:
+    """Return PyTorch's shifted keypoints by the names of the graph's outputs."""
+    with torch.inference_mode():
+        places = network.deformed_positions(batch, levels)
+    return {f"{name}_place_{number}": each.numpy() for name, own in places.items() for number, each in enumerate(own)}
+
+
+def _require(stage: str, expected: Array, found: Array, scan: int) -> float:
+    """Return the largest difference, relative to the largest value where that is above 1."""
+    scale = max(1.0, float(np.abs(expected).max(initial=0.0)))
+    return require_close(stage, expected, found, RELATIVE_TOLERANCE * scale, scan) / scale
 
 
 def export_pv_rcnn_bundle(

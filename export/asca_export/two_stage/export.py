@@ -1,4 +1,7 @@
-"""Export of the second stage's checkpoint to a bundle with both stages."""
+"""Export of the second stage's checkpoint to a bundle with both stages.
+
+Parity with the trained model is proven graph by graph on the same inputs, then of the boxes.
+"""
 
 import dataclasses
 import shutil
@@ -8,16 +11,18 @@ from pathlib import Path
 
 import numpy as np
 import onnx
+import torch
 from numpy.typing import NDArray
 
 from asca_deploy.bundle import BACKBONE, BUNDLE_FOLDER, ENCODER, REFINE, Parity, PillarBundle, RefineSection
 from asca_deploy.detector import Detector
 from asca_deploy.manifest import load_pillar_bundle
 from asca_deploy.shipped import find_bundle
-from asca_deploy.two_stage.pipeline import RefinePipeline
+from asca_deploy.two_stage.pipeline import RefinePipeline, refine_inputs
 from asca_export import graphs
 from asca_export.bundle_writer import DEFAULTS, ExportOptions, draft_bundle, require_parity_scans, write_bundle
 from asca_export.int8 import MAX_LOGIT_ERROR, calibration_scans, logit_error, write_quantized
+from asca_export.parity import MAP_TOLERANCE, require_close, require_compared, require_same_refined
 from asca_export.pillar.export import export_pillar_bundle
 from asca_export.two_stage.first_stage import (
     BundleFirstStage,
@@ -28,15 +33,66 @@ from asca_export.two_stage.first_stage import (
     scale_bev,
 )
 from asca_export.two_stage.graphs import export_refine
-from asca_export.two_stage.parity import check_refine_parity
 from asca_pillars.base.errors import ExportError
 from asca_pillars.base.files import atomic_directory
 from asca_pillars.base.system import default_threads
 from asca_pillars.config.tree import pillar_spec
+from asca_pillars.config.two_stage import RefineModel
+from asca_pillars.detection.decode import HeadMaps
 from asca_pillars.models.build import Checkpoint, load_checkpoint
 from asca_pillars.models.two_stage.first_stage import with_first_stage
+from asca_pillars.models.two_stage.layers import PillarRefiner
 from asca_pillars.models.two_stage.network import RefineDetector
-from asca_pillars.ops.two_stage.first_stage import FirstStage
+from asca_pillars.models.two_stage.preparation import collate_scans
+from asca_pillars.ops.two_stage.first_stage import FirstStage, second_stage_inputs
+from asca_pillars.ops.two_stage.prepare import refine_scan
+
+
+def check_refine_parity(
+    refiner: PillarRefiner,
+    stage: FirstStage,
+    runtime: RefinePipeline,
+    model: RefineModel,
+    scans: Sequence[NDArray[np.float32]],
+) -> Parity:
+    """Compare the first stage as it was trained on and the second in PyTorch with the exported graphs.
+
+    The second stage's graph and its boxes are compared on the same proposals, because a proposal that one side has
+    and the other lacks, by a tie between scores, would hide what the graph does.
+
+    Args:
+        refiner: in evaluation mode.
+        stage: the first stage that it was trained on.
+        runtime: opened on the bundle.
+        scans: (N, 4) each.
+
+    Raises:
+        ExportError: they differ; names the first stage that does, and the scan. Or no scan has a point in the ranges.
+    """
+    worst = worst_box = worst_yaw = 0.0
+    compared = 0
+    for number, scan in enumerate(scans):
+        points = scan[np.isfinite(scan).all(axis=1)]
+        expected, found = stage(points), runtime.infer(runtime.prepare(points, []), []).found
+        for name, one, other in zip(HeadMaps._fields, expected.maps, found.maps, strict=True):
+            worst = max(worst, require_close(f"head `{name}`", one, other, MAP_TOLERANCE, number))
+        allowed = MAP_TOLERANCE * max(1.0, float(np.abs(expected.neck).max(initial=0.0)))
+        worst = max(worst, require_close("neck", expected.neck, found.neck, allowed, number))
+        proposed = second_stage_inputs(found, points, model.spec, model.refine.seen)
+        if not len(proposed.proposals):
+            continue
+        compared += 1
+        asked = refine_scan(points, proposed, proposed.proposals, model.refine.neighbors)
+        with torch.inference_mode():
+            wanted = refiner(collate_scans([asked]))
+        ours = wanted.confidence.numpy(), wanted.residuals.numpy()
+        theirs = runtime.refine(refine_inputs(asked))
+        for name, one, other in zip(("confidence", "residuals"), ours, theirs, strict=True):
+            worst = max(worst, require_close(f"refine `{name}`", one, other, MAP_TOLERANCE, number))
+        scores = model.refine.scores
+        difference = require_same_refined(proposed.proposals, ours, theirs, model.spec, scores, number)
+        worst_box, worst_yaw = max(worst_box, difference.center_size_m), max(worst_yaw, difference.yaw_rad)
+    return Parity(worst, worst_box, worst_yaw, require_compared(compared), MAP_TOLERANCE)
 
 
 def export_refine_bundle(

@@ -16,9 +16,8 @@ from asca_deploy.bundle import DEFORM, GRAPHS, PvRcnnBundle, PvRcnnSection
 from asca_deploy.manifest import load_bundle, load_pillar_bundle
 from asca_deploy.pv_rcnn.graphs import VoxelCanvas, balls_around, deform_inputs, keeps_memory
 from asca_deploy.pv_rcnn.pipeline import PvRcnnPipeline
-from asca_export.pv_rcnn.export import export_pv_rcnn_bundle
+from asca_export.pv_rcnn.export import check_pv_rcnn_parity, export_pv_rcnn_bundle
 from asca_export.pv_rcnn.graphs import export_deform
-from asca_export.pv_rcnn.parity import check_pv_rcnn_parity
 from asca_pillars.base.errors import BundleError, ExportError
 from asca_pillars.config.pv_rcnn import PvRcnnModel
 from asca_pillars.config.tree import load_config

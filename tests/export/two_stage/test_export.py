@@ -18,10 +18,9 @@ from asca_deploy.two_stage.pipeline import RefinePipeline
 from asca_export.bundle_writer import ExportOptions
 from asca_export.int8 import MAX_LOGIT_ERROR
 from asca_export.pillar.export import export_pillar_bundle
-from asca_export.two_stage.export import export_refine_bundle
+from asca_export.two_stage.export import check_refine_parity, export_refine_bundle
 from asca_export.two_stage.first_stage import open_exported
 from asca_export.two_stage.graphs import fold_norms
-from asca_export.two_stage.parity import check_refine_parity
 from asca_pillars.base.errors import BundleError, ExportError
 from asca_pillars.models.build import Checkpoint, build_model, load_checkpoint
 from asca_pillars.models.pillar.network import PillarDetector

@@ -8,9 +8,9 @@ from asca_pillars.detection.detections import Detections
 from asca_pillars.models.two_stage.layers import BallSource, KeypointEncoder, PillarRefiner, RoiHead, SetAbstraction
 from asca_pillars.models.two_stage.preparation import RefineBatch, RefineSample, collate_samples, sample_of
 from asca_pillars.ops.points.sampling import farthest_points
+from asca_pillars.ops.two_stage.decode import match_proposals, sample_rois
 from asca_pillars.ops.two_stage.first_stage import SecondStageInputs
 from asca_pillars.ops.two_stage.prepare import RefineSettings
-from asca_pillars.ops.two_stage.rois import match_proposals, sample_rois
 from tests.helpers.scenes import make_scene
 
 NAMES = ("Car", "Pedestrian", "Cyclist")

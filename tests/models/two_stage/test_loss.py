@@ -16,7 +16,7 @@ from asca_pillars.models.two_stage.loss import (
     distance_iou_loss,
     refine_loss,
 )
-from asca_pillars.ops.two_stage.rois import boxes_in_frames, encode_refinement
+from asca_pillars.ops.two_stage.decode import boxes_in_frames, encode_refinement
 from tests.ops.points.boxes_near import CHANGES, PROPOSALS, changed
 
 

@@ -4,8 +4,8 @@ import numpy as np
 
 from asca_pillars.sim.bodies.primitives import Primitives
 from asca_pillars.sim.casting.raycast import Bodies, cast
-from asca_pillars.sim.sensor.lidar import Lidar, draw_firings
-from asca_pillars.sim.sensor.returns import measure
+from asca_pillars.sim.lidar import Lidar, draw_firings
+from asca_pillars.sim.returns import measure
 
 GROUND_Z_M = -1.73
 

@@ -9,7 +9,7 @@ from asca_pillars.sim.bodies.primitives import BACKGROUND, Primitives, Surface, 
 from asca_pillars.sim.bodies.vehicles import SALOON, car_body
 from asca_pillars.sim.casting.groundcast import GROUND
 from asca_pillars.sim.casting.raycast import NOTHING, Bodies, cast
-from asca_pillars.sim.sensor.lidar import Firings, Lidar, draw_firings
+from asca_pillars.sim.lidar import Firings, Lidar, draw_firings
 from asca_pillars.sim.world.ground import Ground, draw_relief, make_street
 
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from asca_pillars.sim.casting.raycast import cast
+from asca_pillars.sim.lidar import Lidar, draw_firings
 from asca_pillars.sim.scene_config import SceneConfig
-from asca_pillars.sim.sensor.lidar import Lidar, draw_firings
 from asca_pillars.sim.world.builder import Builder
 from asca_pillars.sim.world.clutter import fill_gaps, hide_partly
 from asca_pillars.sim.world.placement import Occupied, Target

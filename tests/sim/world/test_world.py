@@ -6,8 +6,8 @@ import pytest
 from asca_pillars.sim.bodies.primitives import BACKGROUND, Primitives
 from asca_pillars.sim.casting.groundcast import BALLAST, GROUND, RAIL, ground_material
 from asca_pillars.sim.casting.raycast import Bodies, Hits, cast
+from asca_pillars.sim.lidar import Lidar, draw_firings
 from asca_pillars.sim.scene_config import SceneConfig
-from asca_pillars.sim.sensor.lidar import Lidar, draw_firings
 from asca_pillars.sim.world.builder import Builder, Stretch
 from asca_pillars.sim.world.clutter import SHARES, scatter
 from asca_pillars.sim.world.ground import Ground, draw_relief, make_street

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from asca_pillars.data.kitti import in_image
-from asca_pillars.sim.sensor.lidar import Lidar, draw_firings
+from asca_pillars.sim.lidar import Lidar, draw_firings
 from asca_pillars.sim.simulation import outside_image
 from asca_pillars.sim.world.scene import draw_calibration
 

@@ -13,13 +13,13 @@ from asca_deploy.evaluate import evaluate
 from asca_pillars.base.errors import ConfigError, DatasetError, OutputError
 from asca_pillars.cli.main import app
 from asca_pillars.data.boxes.box_split import BoxSplit
-from asca_pillars.evaluation.tracking.tracking_report import (
+from asca_pillars.evaluation.tracking_report import (
     TrackingReport,
     tracking_json,
     tracking_notes,
     tracking_report,
 )
-from asca_pillars.sim.sequences.sequence_files import simulate_sequences
+from asca_pillars.sim.sequence_files import simulate_sequences
 from asca_pillars.sim.simulation import load_simulation_config
 from tests.helpers.earlier_evaluation import earlier_predictions
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from asca_pillars.evaluation.tracking.tracking_metrics import TrackedFrame
+from asca_pillars.evaluation.tracking_metrics import TrackedFrame
 
 
 def frame(objects: list[int], found: list[int], similarity: list | np.ndarray | None = None) -> TrackedFrame:

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from asca_pillars.sim.casting.raycast import Hits
-from asca_pillars.sim.sensor.lidar import Firings, Lidar, draw_firings
-from asca_pillars.sim.sensor.returns import Returns, measure
+from asca_pillars.sim.lidar import Firings, Lidar, draw_firings
+from asca_pillars.sim.returns import Returns, measure
 
 # Nothing but what a test switches on.
 QUIET = Lidar(

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from asca_pillars.evaluation.tracking.tracking_metrics import Boxes, ClearMot, clear_mot, tracked_frame
-from tests.evaluation.tracking.tracked_frames import frame
+from asca_pillars.evaluation.tracking_metrics import Boxes, ClearMot, clear_mot, tracked_frame
+from tests.evaluation.tracked_frames import frame
 
 
 def of(*found: int | None) -> ClearMot:

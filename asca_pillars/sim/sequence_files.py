@@ -26,8 +26,8 @@ from asca_pillars.data.boxes.box_split import DATASET_FILE
 from asca_pillars.data.kitti import in_image, write_image_set
 from asca_pillars.scans.scan_reader import write_scan
 from asca_pillars.sim.annotation import evidence, nearest_first, occlusion_around
-from asca_pillars.sim.sensor.lidar import Firings, draw_firings
-from asca_pillars.sim.sequences.moving_scene import MovingScene, SceneState, draw_moving_scene
+from asca_pillars.sim.lidar import Firings, draw_firings
+from asca_pillars.sim.moving_scene import MovingScene, SceneState, draw_moving_scene
 from asca_pillars.sim.simulation import (
     COMMAND,
     SimulationConfig,

@@ -21,7 +21,7 @@ from asca_pillars.evaluation.arguments import Evaluation, EvaluationTask
 from asca_pillars.evaluation.boxes.box_predictions import predictions_by_frame, stated_scope
 from asca_pillars.evaluation.report_files import check_output_folder, write_report
 from asca_pillars.evaluation.report_page import ReportPage, TextTable
-from asca_pillars.evaluation.tracking.tracking_metrics import (
+from asca_pillars.evaluation.tracking_metrics import (
     Boxes,
     ClearMot,
     Hota,

@@ -9,9 +9,9 @@ from asca_pillars.sim.bodies.people import pedestrian_body
 from asca_pillars.sim.bodies.primitives import Primitives
 from asca_pillars.sim.casting.groundcast import RELIEF_STEP_M, ground_material
 from asca_pillars.sim.casting.raycast import Bodies, cast
+from asca_pillars.sim.lidar import Lidar, draw_firings
+from asca_pillars.sim.moving_scene import MovingScene, draw_moving_scene
 from asca_pillars.sim.scene_config import SceneConfig
-from asca_pillars.sim.sensor.lidar import Lidar, draw_firings
-from asca_pillars.sim.sequences.moving_scene import MovingScene, draw_moving_scene
 from asca_pillars.sim.world.streets import draw_ground
 
 

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from asca_pillars.evaluation.tracking.tracking_metrics import ALPHAS, TrackedFrame, hota
-from tests.evaluation.tracking.tracked_frames import frame
+from asca_pillars.evaluation.tracking_metrics import ALPHAS, TrackedFrame, hota
+from tests.evaluation.tracked_frames import frame
 
 
 def twin(frames: list[TrackedFrame]) -> list[float]:

@@ -10,8 +10,8 @@ from asca_pillars.base.errors import ConfigError
 from asca_pillars.base.settings import parse
 from asca_pillars.sim.bodies.primitives import Surface, quads
 from asca_pillars.sim.casting.raycast import Bodies, cast
-from asca_pillars.sim.sensor.lidar import Lidar, draw_firings
-from asca_pillars.sim.sensor.returns import Returns, measure
+from asca_pillars.sim.lidar import Lidar, draw_firings
+from asca_pillars.sim.returns import Returns, measure
 from asca_pillars.sim.simulation import SimulationConfig, simulate_frame
 from asca_pillars.sim.world.ground import Ground, make_street
 

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 import shapely
 
-from asca_pillars.sim.scene_config import SceneConfig
-from asca_pillars.sim.sequences.moving_scene import (
+from asca_pillars.sim.moving_scene import (
     EGO_M,
     FAR_M,
     RING_M,
@@ -14,6 +13,7 @@ from asca_pillars.sim.sequences.moving_scene import (
     draw_moving_scene,
     held_footprints,
 )
+from asca_pillars.sim.scene_config import SceneConfig
 from asca_pillars.sim.world.placement import ON_FOOT
 from tests.geometry.overlap_oracles import polygon
 

@@ -13,7 +13,7 @@ from asca_pillars.base.compiling import cached
 from asca_pillars.geometry.arrays import Floats, Ints, Mask, Singles
 from asca_pillars.sim.casting.raycast import Hits
 from asca_pillars.sim.casting.rays import PLAIN, ray_bits
-from asca_pillars.sim.sensor.lidar import Firings
+from asca_pillars.sim.lidar import Firings
 
 FADING = 0.5  # spread of the power between firings, in logarithm
 PIVOT = 0.4  # the reflectance that the response does not change

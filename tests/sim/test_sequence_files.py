@@ -9,7 +9,7 @@ import pytest
 from asca_pillars.base.errors import ConfigError, DatasetError
 from asca_pillars.data.boxes.box_split import BoxSplit
 from asca_pillars.geometry.boxes import points_in_boxes
-from asca_pillars.sim.sequences.sequence_files import SequencePlan, simulate_sequence_frame, simulate_sequences
+from asca_pillars.sim.sequence_files import SequencePlan, simulate_sequence_frame, simulate_sequences
 from asca_pillars.sim.simulation import SimulationConfig, load_simulation_config
 
 VLP = load_simulation_config("vlp_16", "around")

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from asca_pillars.evaluation.tracking.tracking_metrics import TrackedFrame, clear_mot, hota
+from asca_pillars.evaluation.tracking_metrics import TrackedFrame, clear_mot, hota
 from asca_pillars.geometry.overlap import iou_3d
 
 trackeval_clear = pytest.importorskip("trackeval.metrics.clear")

@@ -1,1 +1,0 @@
-"""Work over many machines: shards, their recovery when a worker dies, and Ray, which runs them."""

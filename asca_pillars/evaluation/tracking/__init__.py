@@ -1,1 +1,0 @@
-"""Evaluation of tracking: HOTA and CLEAR MOT."""

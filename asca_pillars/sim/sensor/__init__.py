@@ -1,1 +1,0 @@
-"""Sensor model: the measurement of each hit."""

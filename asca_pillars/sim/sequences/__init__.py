@@ -1,1 +1,0 @@
-"""Short drives: the same street scan by scan, with moving car and road users."""
