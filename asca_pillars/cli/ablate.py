@@ -82,7 +82,7 @@ def ablate(
     from asca_pillars.cli.progress import Bars
     from asca_pillars.config.tree import load_config
     from asca_pillars.data.kitti import KittiSplit
-    from asca_pillars.training.prepare import prepare
+    from asca_pillars.training.dataset import prepare
 
     console = Console(markup=False)
     overrides = override or []

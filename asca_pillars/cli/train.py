@@ -47,7 +47,7 @@ def prepare(
         for path in write_train_val_lists(data):
             console.print(f"written: {path}", soft_wrap=True, highlight=False)
     require("train")
-    from asca_pillars.training.prepare import prepare as run
+    from asca_pillars.training.dataset import prepare as run
 
     with Bars(console) as bars:
         inserter = run(settings, data, workers=workers, reporter=Reporter(bars))

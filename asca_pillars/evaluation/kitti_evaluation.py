@@ -19,7 +19,7 @@ from asca_pillars.data.boxes.box_records import check_yaws
 from asca_pillars.data.frames import LabeledSplit
 from asca_pillars.data.kitti import KittiSplit
 from asca_pillars.detection.spec import ScoreThresholds
-from asca_pillars.evaluation import gallery
+from asca_pillars.evaluation import report_files
 from asca_pillars.evaluation.arguments import (
     Evaluation,
     EvaluationTask,
@@ -328,17 +328,17 @@ def draw_gallery(
     count = GALLERY_FRAMES if count is None else count
     if task.split is None or count == 0:
         return
-    own = gallery.EvaluatedDetector(task.subject, task.predictions, _match_at_scores(frames, task.scores))
+    own = report_files.EvaluatedDetector(task.subject, task.predictions, _match_at_scores(frames, task.scores))
     detectors = (
         [own] if compare is None else _with_distinct_names(own, task, _read_compared(compare, task, frames, reporter))
     )
     with atomic_directory(out / "gallery", *GALLERY_FOLDER) as folder:
-        gallery.write_gallery(folder, detectors, count, task.split, task.labels, task.ranges, reporter=reporter)
+        report_files.write_gallery(folder, detectors, count, task.split, task.labels, task.ranges, reporter=reporter)
 
 
 def _with_distinct_names(
-    own: gallery.EvaluatedDetector, task: Task, other: gallery.EvaluatedDetector
-) -> list[gallery.EvaluatedDetector]:
+    own: report_files.EvaluatedDetector, task: Task, other: report_files.EvaluatedDetector
+) -> list[report_files.EvaluatedDetector]:
     """Return both detectors named by their models, or by their folders if these are the same."""
     named = [replace(own, name=_name(task.about, task.predictions)), other]
     if named[0].name == named[1].name:
@@ -346,18 +346,20 @@ def _with_distinct_names(
     return named
 
 
-def _read_compared(compare: Path, task: Task, frames: ScoredFrames, reporter: Reporter) -> gallery.EvaluatedDetector:
+def _read_compared(
+    compare: Path, task: Task, frames: ScoredFrames, reporter: Reporter
+) -> report_files.EvaluatedDetector:
     """Return the detector of a folder of predictions, at its own scores if an evaluation of it states them."""
     about = _made_by(compare)
     found = read_predictions(compare, frames.truth, task.labels, reporter=reporter)
     if found.shortage is not None:
         reporter.remark(f"--compare {compare}: {found.shortage}")
-    return gallery.EvaluatedDetector(
+    return report_files.EvaluatedDetector(
         _name(about, compare), compare, _match_at_scores(found, task.scores | _stated_scores(about))
     )
 
 
-def _match_at_scores(frames: ScoredFrames, scores: dict[str, float]) -> gallery.Matches:
+def _match_at_scores(frames: ScoredFrames, scores: dict[str, float]) -> report_files.Matches:
     return matches_at_score(frames.truth, frames.detections, CLASS_NAMES, scores=scores)
 
 

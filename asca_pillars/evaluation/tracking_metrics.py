@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from asca_pillars.detection.targets import UNMATCHED, best_assignments
-from asca_pillars.geometry.arrays import Floats, Ints, Mask, Singles
+from asca_pillars.geometry.boxes import Floats, Ints, Mask, Singles
 from asca_pillars.geometry.overlap import iou_3d
 
 IGNORED_IOU = 0.25

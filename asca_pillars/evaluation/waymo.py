@@ -43,8 +43,7 @@ from asca_pillars.data.kitti import KittiSplit
 from asca_pillars.detection.detections import Detections
 from asca_pillars.detection.targets import UNMATCHED, best_assignments
 from asca_pillars.evaluation.kitti.average_precision import CLASS_NAMES
-from asca_pillars.evaluation.kitti.objects import FrameObjects, is_neighbor
-from asca_pillars.evaluation.kitti.pairs import Frames, dont_care_shares
+from asca_pillars.evaluation.kitti.objects import FrameObjects, Frames, dont_care_shares, is_neighbor
 from asca_pillars.evaluation.kitti.score_threshold import DONT_CARE_SHARE
 from asca_pillars.evaluation.predictions import FOLDED_KITTI_TYPES, ScoredFrames
 from asca_pillars.evaluation.report_page import TextTable

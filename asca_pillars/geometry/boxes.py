@@ -1,4 +1,4 @@
-"""Box convention, and operations on single boxes: corners, points inside, residuals.
+"""Box convention, ranges, and operations on single boxes: corners, points inside, residuals.
 
 Frame: LiDAR, metres. x forward, y left, z up; yaw counter-clockwise about +z from +x, in [-pi, pi).
 
@@ -15,8 +15,6 @@ Frame: LiDAR, metres. x forward, y left, z up; yaw counter-clockwise about +z fr
                     rear-left  width  rear-right
 
 Box: (x, y, z, length, width, height, yaw), one row of an (N, 7) array.
-
-Point cloud range of a detector.
 """
 
 import math
@@ -25,6 +23,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+Floats = NDArray[np.float64]
+Singles = NDArray[np.float32]
+Floating = NDArray[np.floating[Any]]
+"""Any floating-point type."""
+Ints = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
 
 DIRECTION_OFFSET_RAD = math.pi / 4
 """Yaw at which direction bin 0 begins by default: it contains yaws in [pi/4, 5pi/4), bin 1 the others.

@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from asca_pillars.geometry.arrays import Floats
-from asca_pillars.geometry.boxes import wrap_angle
+from asca_pillars.geometry.boxes import Floats, wrap_angle
 
 
 def rotations_from_quaternions(quaternions: NDArray[Any]) -> Floats:

@@ -10,7 +10,7 @@ import numpy as np
 from numba import types
 
 from asca_pillars.base.compiling import compiled, in_array, inner, out_array
-from asca_pillars.geometry.arrays import Floats, Ints
+from asca_pillars.geometry.boxes import Floats, Ints
 
 
 def nms(boxes: Floats, iou_threshold: float, limit: int) -> Ints:

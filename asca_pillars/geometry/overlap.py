@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from asca_pillars.geometry.arrays import Floating, Floats, Ints, Mask, Singles
-from asca_pillars.geometry.boxes import wrap_angle
+from asca_pillars.geometry.boxes import Floating, Floats, Ints, Mask, Singles, wrap_angle
 
 _Point = tuple[Floats, Floats]  # x and y of K points, each (K,)
 

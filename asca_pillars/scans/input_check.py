@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from asca_pillars.base.errors import ConfigError
 from asca_pillars.base.strict import Strict
 from asca_pillars.detection.detections import ScanCounts
-from asca_pillars.geometry.arrays import Floating, Mask, Singles
-from asca_pillars.geometry.boxes import Ranges
+from asca_pillars.geometry.boxes import Floating, Mask, Ranges, Singles
 from asca_pillars.scans.mounting import Mounting
 
 _HIGHEST_M = 100.0  # larger heights of the ground are not plausible

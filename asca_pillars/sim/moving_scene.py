@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from asca_pillars.geometry.arrays import Floats, Ints
+from asca_pillars.geometry.boxes import Floats, Ints
 from asca_pillars.geometry.overlap import paired_bev_touch
 from asca_pillars.sim.scene_config import SceneConfig
 from asca_pillars.sim.world.ground import Ground

@@ -1,11 +1,12 @@
 """Training samples: labelled frames, augmented and prepared for a family of detectors.
 
 Labels are checked before a training, which would fail without usable boxes.
+`prepare` computes the caches of a dataset before a training instead of during its first epoch.
 """
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,9 @@ from asca_pillars.config.tree import Config
 from asca_pillars.data.augment import TrainingFrames, open_frames
 from asca_pillars.data.boxes.box_records import check_yaws
 from asca_pillars.data.frames import LabeledFrame, LabeledSplit, other_spelling, read_frame, within_ranges
+from asca_pillars.data.insertion.free_space import prepare_free_spaces
+from asca_pillars.data.insertion.insert_objects import Inserter, prepare_inserter
+from asca_pillars.data.open_split import open_split
 from asca_pillars.models.build import build_preparation
 from asca_pillars.models.trainable import Preparation, to_device
 
@@ -221,3 +225,35 @@ def open_dataset(root: str | Path, config: Config, *, training: bool, reporter: 
     """
     frames = open_frames(root, config, training=training, reporter=reporter)
     return LabeledDataset(frames, build_preparation(config.model, frames.split, config.data, reporter))
+
+
+def prepare(config: Config, data: str | Path, *, workers: int, reporter: Reporter = SILENT) -> Inserter | None:
+    """Compute the object database and the maps of free ground, or for a second stage the proposals of its first.
+
+    What is there and unchanged is used again.
+
+    Args:
+        config: of the training. Without an insertion method in it, what RS-Aug needs is prepared.
+        data: a dataset's folder.
+        workers: processes.
+        reporter: for the progress.
+
+    Returns:
+        What inserts objects; None for a second stage, which has no insertion.
+
+    Raises:
+        AscaError: a frame cannot be read, or a file not be written.
+    """
+    settings = replace(config.data, workers=workers)
+    if config.model.kind == "pillar_refine":
+        for name in (settings.train_set, settings.val_set):
+            build_preparation(config.model, open_split(data, name), settings, reporter)
+        return None
+    insert = config.augment.insert
+    insert = insert if insert.method != "none" else replace(insert, method="rs_aug")
+    split = open_split(data, settings.train_set)
+    inserter = prepare_inserter(split, config.model.spec, settings, insert, reporter)
+    if insert.method == "rs_aug":
+        view = inserter.camera_view
+        prepare_free_spaces(split, inserter.prepared, camera_view=view, workers=workers, reporter=reporter)
+    return inserter

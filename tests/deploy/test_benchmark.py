@@ -15,7 +15,6 @@ from asca_deploy.benchmark import (
     alternate,
     bench_report,
     benchmark,
-    cold,
     cold_start,
     compare,
     measure_matrix,
@@ -148,10 +147,10 @@ def test_new_processes_have_the_mounting_of_the_detector(
 ) -> None:
     """A process of its own runs for one of them; for the other its program runs here, which takes no seconds."""
     seen: list[Mounting] = []
-    run = cold._run if mounting.pose is None else here
+    run = bench_report._run if mounting.pose is None else here
 
     def spy(code: str, *arguments: object) -> str:
-        if code == cold._DETECT:
+        if code == bench_report._DETECT:
             options = dict(zip(map(str, arguments[3::2]), map(str, arguments[4::2]), strict=True))
             height = float(options["--sensor-height"]) if "--sensor-height" in options else None
             pose = read_pose(options["--pose"]) if "--pose" in options else None
@@ -160,7 +159,7 @@ def test_new_processes_have_the_mounting_of_the_detector(
             seen.append(Mounting(**json.loads(str(arguments[-1]))))
         return run(code, *arguments)
 
-    monkeypatch.setattr(cold, "_run", spy)
+    monkeypatch.setattr(bench_report, "_run", spy)
     found = cold_start(Detector(tiny_bundle, threads=1, mounting=mounting), scan, repeats=1)
     assert seen == [mounting, mounting]
     assert found.first_boxes_s >= found.import_s + found.load_s + found.first_scan_s

@@ -28,8 +28,7 @@ from asca_pillars.data.insertion.ground_fit import (
     order_by_cell,
 )
 from asca_pillars.data.insertion.prepared import require_writable, writable_atomic_path
-from asca_pillars.geometry.arrays import Floating, Floats, Ints, Mask, Singles
-from asca_pillars.geometry.boxes import footprints
+from asca_pillars.geometry.boxes import Floating, Floats, Ints, Mask, Singles, footprints
 from asca_pillars.scans.ground_height import plane_heights
 
 CELL_M = 0.25

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from asca_pillars.geometry.arrays import Floating, Floats, Ints, Singles
+from asca_pillars.geometry.boxes import Floating, Floats, Ints, Singles
 from asca_pillars.scans.ground_height import most_common_plane, plane_heights
 
 REACH_M = 80.0  # farther points are ignored

@@ -31,8 +31,7 @@ from asca_pillars.data.insertion.gt_database import ObjectDatabase, StoredObject
 from asca_pillars.data.insertion.prepared import prepared_folder
 from asca_pillars.detection.anchors import IGNORED
 from asca_pillars.detection.spec import DetectorSpec
-from asca_pillars.geometry.arrays import Floating, Floats, Mask, Singles
-from asca_pillars.geometry.boxes import Ranges, points_in_boxes, wrap_angle
+from asca_pillars.geometry.boxes import Floating, Floats, Mask, Ranges, Singles, points_in_boxes, wrap_angle
 from asca_pillars.geometry.frame_change import FrameChange, transform_columns, transform_points
 from asca_pillars.geometry.overlap import paired_bev_touch
 

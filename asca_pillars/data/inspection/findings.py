@@ -19,8 +19,7 @@ from asca_pillars.data.frames import LabeledSplit, other_spelling
 from asca_pillars.data.inspection.inspect_dataset import ClassFacts, Inspection, ScanFacts
 from asca_pillars.data.inspection.measurements import InspectedSpec, better_convention, input_cells
 from asca_pillars.detection.anchors import ANCHOR_YAWS_RAD, ClassSpec
-from asca_pillars.geometry.arrays import Floats, Singles
-from asca_pillars.geometry.boxes import points_in_boxes
+from asca_pillars.geometry.boxes import Floats, Singles, points_in_boxes
 from asca_pillars.geometry.overlap import aligned_bev_iou
 from asca_pillars.ops.pillar.grid import NECK_STRIDE
 from asca_pillars.ops.pillar.spec import PillarSpec

@@ -24,8 +24,7 @@ from numpy.typing import NDArray
 
 from asca_pillars.evaluation.boxes.box_pairs import UNMATCHED, BoxPairs, EvaluatedFrame, pair_class
 from asca_pillars.evaluation.boxes.nuscenes_metrics import DISTANCES_M, ERROR_DISTANCE_M, RECALLS
-from asca_pillars.geometry.arrays import Floats
-from asca_pillars.geometry.boxes import wrap_angle
+from asca_pillars.geometry.boxes import Floats, wrap_angle
 
 MAX_DETECTIONS = 100
 MAX_RANGE_M = 150.0

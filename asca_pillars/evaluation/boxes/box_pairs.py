@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_pillars.data.frames import NEIGHBOR_TYPES
-from asca_pillars.geometry.arrays import Floats, Ints, Mask
+from asca_pillars.geometry.boxes import Floats, Ints, Mask
 
 UNMATCHED = -1
 

@@ -23,8 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_pillars.evaluation.boxes.box_pairs import BANDS, BoxPairs, EvaluatedFrame, in_band, pair_class
-from asca_pillars.geometry.arrays import Floats
-from asca_pillars.geometry.boxes import wrap_angle
+from asca_pillars.geometry.boxes import Floats, wrap_angle
 
 DISTANCES_M = (0.5, 1.0, 2.0, 4.0)
 ERROR_DISTANCE_M = 2.0

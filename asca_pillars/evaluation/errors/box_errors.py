@@ -33,8 +33,7 @@ from asca_pillars.detection.targets import match_by_overlap
 from asca_pillars.evaluation.errors.error_frames import ErrorFrame
 from asca_pillars.evaluation.errors.label_fit import view_angle_deg
 from asca_pillars.evaluation.recall import BEV_IOU, SMALL_BEV_IOU
-from asca_pillars.geometry.arrays import Floats, Ints, Mask
-from asca_pillars.geometry.boxes import wrap_angle
+from asca_pillars.geometry.boxes import Floats, Ints, Mask, wrap_angle
 from asca_pillars.geometry.overlap import bev_iou
 
 LOCALIZATION_IOU = 0.1

@@ -14,12 +14,13 @@ from asca_pillars.data.kitti import KittiSplit, boxes_from_objects, read_labels
 from asca_pillars.evaluation.boxes.box_pairs import EvaluatedFrame
 from asca_pillars.evaluation.kitti.objects import (
     FrameObjects,
+    Frames,
     KittiState,
     detection_states,
+    dont_care_shares,
     frame_objects,
     truth_states,
 )
-from asca_pillars.evaluation.kitti.pairs import Frames, dont_care_shares
 from asca_pillars.evaluation.kitti.score_threshold import DONT_CARE_SHARE
 from asca_pillars.evaluation.predictions import KITTI_TYPES
 from asca_pillars.geometry.boxes import points_in_boxes

@@ -33,14 +33,17 @@ from numpy.typing import NDArray
 from asca_pillars.base.progress import SILENT, Reporter
 from asca_pillars.evaluation.kitti.objects import (
     FrameObjects,
+    Frames,
     KittiState,
+    Pairs,
     detection_states,
+    dont_care_shares,
     is_neighbor,
     is_type,
+    overlapping_pairs,
     truth_states,
 )
-from asca_pillars.evaluation.kitti.pairs import Frames, Pairs, dont_care_shares, overlapping_pairs
-from asca_pillars.geometry.arrays import Floats, Ints, Mask
+from asca_pillars.geometry.boxes import Floats, Ints, Mask
 
 
 class ClassStates(NamedTuple):

@@ -33,14 +33,17 @@ from asca_pillars.detection.targets import greedy_matches
 from asca_pillars.evaluation.kitti.average_precision import min_overlap as kitti_min_overlap
 from asca_pillars.evaluation.kitti.objects import (
     FrameObjects,
+    Frames,
     KittiState,
+    Pairs,
     detection_states,
+    dont_care_shares,
     is_neighbor,
     is_type,
+    overlapping_pairs,
     truth_states,
 )
-from asca_pillars.evaluation.kitti.pairs import Frames, Pairs, dont_care_shares, overlapping_pairs
-from asca_pillars.geometry.arrays import Mask
+from asca_pillars.geometry.boxes import Mask
 
 DONT_CARE_SHARE = 0.5  # of a detection's 2D box in one DontCare area; with more it is ignored
 

@@ -13,7 +13,7 @@ from typing import IO, Any, NamedTuple
 import numpy as np
 
 from asca_pillars.base.errors import ScanError
-from asca_pillars.scans.recordings.decompression import decompress_lz4, decompress_zstd
+from asca_pillars.scans.recordings.messages import decompress_lz4, decompress_zstd
 from asca_pillars.scans.recordings.recording import (
     LAST_NS,
     UNKNOWN_TYPE,

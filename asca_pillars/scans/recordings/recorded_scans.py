@@ -15,8 +15,8 @@ from asca_pillars.geometry.frame_change import transform_points
 from asca_pillars.scans.find_scans import is_scan, natural_order, visible_files
 from asca_pillars.scans.ground_height import NamedPoints
 from asca_pillars.scans.mounting import Mounting
-from asca_pillars.scans.recordings.decompression import UNPACKERS, decompress_file
 from asca_pillars.scans.recordings.mcap_files import McapRecording
+from asca_pillars.scans.recordings.messages import UNPACKERS, decompress_file
 from asca_pillars.scans.recordings.packet_files import OusterPackets, PacketCapture
 from asca_pillars.scans.recordings.point_clouds import PointCloud, read_point_cloud
 from asca_pillars.scans.recordings.recording import Message, Recording, Topic, kind_of_scans

@@ -16,7 +16,7 @@ import yaml
 
 from asca_pillars.base.errors import ScanError
 from asca_pillars.base.settings import MAX_CHARACTERS, parse_yaml
-from asca_pillars.scans.recordings.decompression import decompress_bz2, decompress_lz4
+from asca_pillars.scans.recordings.messages import decompress_bz2, decompress_lz4
 from asca_pillars.scans.recordings.recording import (
     LAST_NS,
     SEVERAL_TYPES,

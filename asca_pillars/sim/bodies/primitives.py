@@ -10,7 +10,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from asca_pillars.geometry.arrays import Floats, Mask
+from asca_pillars.geometry.boxes import Floats, Mask
 
 BACKGROUND = -1  # owner of unlabelled primitives
 

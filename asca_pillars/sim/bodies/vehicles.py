@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from asca_pillars.geometry.arrays import Floats
+from asca_pillars.geometry.boxes import Floats
 from asca_pillars.sim.bodies.primitives import Primitives, Surface, cuboids, ellipsoids, quads
 
 

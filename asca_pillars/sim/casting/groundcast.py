@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_pillars.base.compiling import cached
-from asca_pillars.geometry.arrays import Floats, Mask
+from asca_pillars.geometry.boxes import Floats, Mask
 from asca_pillars.sim.casting.rays import PLAIN, NearestHits, Rays, ray_chance
 
 GROUND = -2  # owner of ground returns

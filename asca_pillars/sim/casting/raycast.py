@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_pillars.base.compiling import cached
-from asca_pillars.geometry.arrays import Floats, Ints, Singles
+from asca_pillars.geometry.boxes import Floats, Ints, Singles
 from asca_pillars.sim.bodies.primitives import Primitives
 from asca_pillars.sim.casting.groundcast import cast_ground
 from asca_pillars.sim.casting.rays import (

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_pillars.base.compiling import cached
-from asca_pillars.geometry.arrays import Floats, Ints, Mask, Singles
+from asca_pillars.geometry.boxes import Floats, Ints, Mask, Singles
 from asca_pillars.sim.lidar import Firings
 
 NOTHING = -3  # owner of a firing without a hit

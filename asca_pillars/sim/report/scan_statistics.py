@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 
 from asca_pillars.data.kitti import KittiObject, KittiSplit, boxes_from_objects, in_image, objects_3d
 from asca_pillars.evaluation.errors.label_fit import STATISTICS, label_fit, view_angle_deg
-from asca_pillars.geometry.arrays import Floats, Ints, Singles
-from asca_pillars.geometry.boxes import points_in_boxes
+from asca_pillars.geometry.boxes import Floats, Ints, Singles, points_in_boxes
 from asca_pillars.scans.scan_reader import read_scan
 from asca_pillars.sim.report.reference import (
     BAND_M,

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from asca_pillars.base.compiling import cached
-from asca_pillars.geometry.arrays import Floats, Mask
+from asca_pillars.geometry.boxes import Floats, Mask
 from asca_pillars.sim.bodies.primitives import Primitives, cuboids, ellipsoids, prisms
 from asca_pillars.sim.scene_config import SceneConfig
 from asca_pillars.sim.world.ground import Ground

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from asca_pillars.sim.bodies.cycles import motorbike_body, parked_bicycle_body
+from asca_pillars.sim.bodies.people import motorbike_body, parked_bicycle_body
 from asca_pillars.sim.world.builder import Builder, Material
 from asca_pillars.sim.world.furniture import (
     barrier_boards,

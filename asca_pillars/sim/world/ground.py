@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from asca_pillars.geometry.arrays import Floats, Mask
+from asca_pillars.geometry.boxes import Floats, Mask
 from asca_pillars.sim.casting import groundcast
 from asca_pillars.sim.casting.groundcast import NO_RAILS, RELIEF_HALF_M, RELIEF_STEP_M, Street
 

@@ -6,7 +6,7 @@ and cyclists (half of these false positives are lower than 1.2 m), and corners o
 
 import numpy as np
 
-from asca_pillars.sim.bodies.cycles import parked_bicycle_body
+from asca_pillars.sim.bodies.people import parked_bicycle_body
 from asca_pillars.sim.world.builder import Builder
 from asca_pillars.sim.world.furniture import material
 from asca_pillars.sim.world.vegetation import crown

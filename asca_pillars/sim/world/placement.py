@@ -11,7 +11,7 @@ from typing import Literal, NamedTuple, TypeAlias
 import numpy as np
 
 from asca_pillars.base.compiling import cached
-from asca_pillars.geometry.arrays import Floats
+from asca_pillars.geometry.boxes import Floats
 from asca_pillars.sim.scene_config import SceneConfig
 from asca_pillars.sim.world.ground import Ground
 

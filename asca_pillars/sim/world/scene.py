@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from asca_pillars.data.kitti import Calibration
-from asca_pillars.sim.bodies import cycles, people, primitives, vehicles
+from asca_pillars.sim.bodies import people, primitives, vehicles
 from asca_pillars.sim.bodies.primitives import BACKGROUND, Primitives
 from asca_pillars.sim.casting.raycast import Bodies
 from asca_pillars.sim.scene_config import SceneConfig
@@ -137,7 +137,7 @@ def body_of(target: Target, config: SceneConfig, rng: np.random.Generator) -> Pr
     elif name == "Tram":
         body = vehicles.bus_body(rng, length - 0.1, width - 0.08, height - 0.1, rail=True)
     elif name == "Misc" and width < 1.0 and 1.4 < length < 2.5 and height > 1.35:
-        body = cycles.motorcyclist_body(rng, height - 0.08, length - 0.06)
+        body = people.motorcyclist_body(rng, height - 0.08, length - 0.06)
     elif name == "Misc":
         body = vehicles.trailer_body(rng, length - 0.08, width - 0.06, height - 0.08)
     elif name == "Pedestrian":
@@ -145,7 +145,7 @@ def body_of(target: Target, config: SceneConfig, rng: np.random.Generator) -> Pr
     elif name == "Person_sitting":
         body = people.sitting_body(rng, height - 0.05)
     else:
-        body = cycles.cyclist_body(rng, height - 0.08, width, length - 0.04, footprint)
+        body = people.cyclist_body(rng, height - 0.08, width, length - 0.04, footprint)
     most = float(rng.uniform(*config.warp_m))
     if name in ("Pedestrian", "Person_sitting", "Cyclist"):
         body = primitives.scaled(body, rng.uniform((0.94, 0.94, 0.98), (1.06, 1.06, 1.02)))

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from asca_pillars.geometry.arrays import Floats
+from asca_pillars.geometry.boxes import Floats
 from asca_pillars.sim.world.builder import Builder, Stretch
 
 # Far clusters are larger and fewer, as rays cannot resolve them.

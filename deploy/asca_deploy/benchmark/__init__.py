@@ -1,7 +1,6 @@
 """Benchmarks: time per stage, comparison with another detector and with the machine, cold start."""
 
-from asca_deploy.benchmark.bench_report import BenchmarkReport, benchmark
-from asca_deploy.benchmark.cold import ColdStart, cold_start
+from asca_deploy.benchmark.bench_report import BenchmarkReport, ColdStart, benchmark, cold_start
 from asca_deploy.benchmark.speed_comparison import Comparison, Contestant, MatrixRow, alternate, compare, measure_matrix
 from asca_deploy.benchmark.timing import (
     Roofline,

@@ -22,7 +22,7 @@ from asca_deploy.pv_rcnn.pipeline import PvRcnnPipeline
 from asca_export.fast_forms import CanvasSteps, FastBackbone
 from asca_export.graphs import graph_path
 from asca_export.int8 import Points, RoundedMaps, calibration_scans, logit_error, sweep, write_quantized
-from asca_export.pv_rcnn.voxel_forms import RoundedVoxels, VoxelSample
+from asca_export.pv_rcnn.graphs import RoundedVoxels, VoxelSample
 from asca_export.quantize import STEPS
 from asca_export.two_stage.first_stage import scale_bev
 from asca_pillars.base.errors import ExportError

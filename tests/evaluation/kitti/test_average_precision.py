@@ -17,8 +17,7 @@ from hypothesis import strategies as st
 
 from asca_pillars.data.kitti import read_labels
 from asca_pillars.evaluation.kitti.average_precision import METRICS, Curve, evaluate, min_overlap, score_thresholds
-from asca_pillars.evaluation.kitti.objects import FrameObjects, frame_objects
-from asca_pillars.evaluation.kitti.pairs import Frames, overlapping_pairs
+from asca_pillars.evaluation.kitti.objects import FrameObjects, Frames, frame_objects, overlapping_pairs
 from tests.evaluation.kitti.brute_force import brute_force, pick_thresholds
 from tests.evaluation.kitti.kitti_objects import (
     CAR,
@@ -183,7 +182,7 @@ def test_blocks_of_pairs_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None
     frames = Frames.join(*random_frames(0, 8, 20))
     expected = np.arange(len(frames.truth)) % 3 > 0
     whole = overlapping_pairs(frames, expected, 0.5)
-    monkeypatch.setattr("asca_pillars.evaluation.kitti.pairs._BLOCK_PAIRS", 13)
+    monkeypatch.setattr("asca_pillars.evaluation.kitti.objects._BLOCK_PAIRS", 13)
     parts = overlapping_pairs(frames, expected, 0.5)
     assert len(whole.truth) and not set(whole.truth) - set(np.flatnonzero(expected))
     for name in ("truth", "detection", "frame"):

@@ -21,8 +21,8 @@ from asca_export import graphs, int8
 from asca_export.bundle_writer import ExportOptions
 from asca_export.int8 import logit_error
 from asca_export.pv_rcnn.export import export_pv_rcnn_bundle
+from asca_export.pv_rcnn.graphs import VoxelProducts, VoxelSample, scale_voxels_to_steps
 from asca_export.pv_rcnn.int8 import quantize_pv_rcnn_bundle
-from asca_export.pv_rcnn.voxel_forms import VoxelProducts, VoxelSample, scale_voxels_to_steps
 from asca_pillars.base.errors import BundleError, ExportError
 from asca_pillars.models.build import Checkpoint
 from asca_pillars.models.pv_rcnn.network import PvRcnnDetector

@@ -15,7 +15,7 @@ import lz4.frame
 from mcap.writer import CompressionType, IndexType
 
 from asca_pillars.base.errors import ScanError
-from asca_pillars.scans.recordings import decompression, mcap_files
+from asca_pillars.scans.recordings import mcap_files, messages
 from asca_pillars.scans.recordings.recorded_scans import RecordedScans, open_recording
 from asca_pillars.scans.recordings.recording import Recording, Topic
 from tests.scans.recordings.cloud_recordings import (
@@ -191,7 +191,7 @@ def test_chunks_within_the_summary_are_not_decompressed(tmp_path: Path) -> None:
 
 
 def test_a_large_chunk_that_is_large_packed_too_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(decompression, "MAX_BYTES", 100)
+    monkeypatch.setattr(messages, "MAX_BYTES", 100)
     for compression in (CompressionType.ZSTD, CompressionType.LZ4):
         path = write_mcap(tmp_path / "a.mcap", {"/lidar": clouds(8)}, chunk_size=10**6, compression=compression)
         assert times(open_recording(path)) == stamps(8)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from asca_pillars.geometry.boxes import corners
-from asca_pillars.sim.bodies.cycles import motorbike_body, parked_bicycle_body
+from asca_pillars.sim.bodies.people import motorbike_body, parked_bicycle_body
 from asca_pillars.sim.bodies.primitives import Primitives, cuboids, ellipsoids, limbs, prisms
 from asca_pillars.sim.bodies.vehicles import HATCHBACK, Profile, car_body, draw_style
 from asca_pillars.sim.scene_config import SceneConfig

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from asca_pillars.sim.bodies.cycles import cyclist_body
+from asca_pillars.sim.bodies.people import cyclist_body
 from asca_pillars.sim.bodies.primitives import Primitives, darkened, scaled, warped
 from asca_pillars.sim.bodies.vehicles import HATCHBACK, car_body
 

@@ -8,9 +8,9 @@ import pytest
 
 from asca_pillars.data.kitti import KittiSplit, read_labels, write_labels
 from asca_pillars.data.kitti.kitti_labels import KittiObject
-from asca_pillars.evaluation.gallery import EvaluatedDetector, most_different_frames, worst_frames, write_gallery
 from asca_pillars.evaluation.kitti.score_threshold import ScoreMatches, matches_at_score
 from asca_pillars.evaluation.predictions import read_predictions, read_truth
+from asca_pillars.evaluation.report_files import EvaluatedDetector, most_different_frames, worst_frames, write_gallery
 from tests.helpers.gallery_cards import cards, sources, title
 from tests.helpers.scenes import GRID, write_dataset
 

@@ -22,8 +22,8 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 
 from asca_pillars.base.errors import ScanError
-from asca_pillars.scans.recordings import decompression
-from asca_pillars.scans.recordings.decompression import decompress_bz2, decompress_lz4, decompress_zstd
+from asca_pillars.scans.recordings import messages
+from asca_pillars.scans.recordings.messages import decompress_bz2, decompress_lz4, decompress_zstd
 from asca_pillars.scans.recordings.recorded_scans import RecordedScans, is_recording, open_recording
 from asca_pillars.scans.scan_settings import ScanSettings
 from benchmarks.made_recordings import point_cloud2
@@ -89,7 +89,7 @@ def test_another_size_than_the_stated_one_is_an_error(
 def test_decompression_bombs_are_stopped_at_the_limit(
     unpack: Callable[[bytes], bytes], bomb: bytes, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(decompression, "MAX_BYTES", 2**20)
+    monkeypatch.setattr(messages, "MAX_BYTES", 2**20)
     with pytest.raises(ValueError, match=r"\d+ bytes (state that they )?unpack to"):
         unpack(bomb)
 
@@ -215,7 +215,7 @@ def test_copies_are_said_and_removed(tmp_path: Path, monkeypatch: pytest.MonkeyP
 def test_files_that_unpack_to_gigabytes_are_refused(
     tmp_path: Path, name: str, content: bytes, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(decompression, "MAX_FILE_BYTES", 2**24)
+    monkeypatch.setattr(messages, "MAX_FILE_BYTES", 2**24)
     (tmp_path / name).write_bytes(content)
     with pytest.raises(ScanError, match=rf"{name}: unpacks to more than .* unpack it yourself \((zstd -d|gunzip)\)"):
         open_recording(tmp_path / name)
@@ -288,8 +288,8 @@ def test_a_damaged_chunk_of_a_bag_costs_its_messages_alone(tmp_path: Path, compr
 def test_a_chunk_of_a_bag_unpacks_to_no_more_than_the_limit(
     tmp_path: Path, compression: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(decompression, "MAX_BYTES", 300)
-    monkeypatch.setattr(decompression, "MAX_RATIO", 0)
+    monkeypatch.setattr(messages, "MAX_BYTES", 300)
+    monkeypatch.setattr(messages, "MAX_RATIO", 0)
     recording = open_recording(rosbag1(tmp_path / "a.bag", Writer1.CompressionFormat[compression]))
     assert list(recording.messages("/lidar")) == []
     assert "unpack to more than 300" in str(recording.damage)
