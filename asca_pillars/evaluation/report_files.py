@@ -1,6 +1,7 @@
 """Output files of `asca eval`: a page of tables, its JSON, the predictions of its own run, and a gallery.
 
-The gallery has pictures of frames with missed objects and false positives, from above and on the image. The worst frames of one detector, or for two those in which they differ most, side by side.
+The gallery has pictures of frames with missed objects and false positives, from above and on the image. The worst
+frames of one detector, or for two those in which they differ most, side by side.
 """
 
 from collections.abc import Iterable, Sequence

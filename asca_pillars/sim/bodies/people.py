@@ -1,4 +1,4 @@
-"""Pedestrians with what they carry, push and pull, sitting people, and bicycles and motorcycles with and without riders.
+"""Pedestrians with what they carry, push and pull, sitting people, bicycles with and without riders, motorcycles.
 
 People consist of ellipsoids with jointed limbs; x forward, feet or wheels on z = 0.
 """

@@ -1,6 +1,7 @@
 """PV-RCNN as four ONNX graphs, normalization folded into the layers before it; nothing is scattered in them.
 
-The sparse backbone over voxels is a chain of matrix products, in 8 bits too. Its first product reads positions in metres and stays in floating point.
+The sparse backbone over voxels is a chain of matrix products, in 8 bits too. Its first product reads positions in
+metres and stays in floating point.
 """
 
 import copy
