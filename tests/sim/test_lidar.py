@@ -15,7 +15,7 @@ from asca_pillars.sim.returns import Returns, measure
 from asca_pillars.sim.simulation import SimulationConfig, simulate_frame
 from asca_pillars.sim.world.ground import Ground, make_street
 
-FOLDER = Path(__file__).parents[3] / "configs/simulation"
+FOLDER = Path(__file__).parents[2] / "configs/simulation"
 # Rings, highest and lowest elevation, firings per revolution: from the data sheets, not from our files.
 SHEETS = {
     "hdl_32e": (32, 10.67, -30.67, 2170),
