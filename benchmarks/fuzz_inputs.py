@@ -16,7 +16,8 @@ import yaml
 from asca_deploy import default_bundle_path
 from asca_deploy.manifest import load_pillar_bundle
 from asca_pillars.base.errors import ScanError
-from asca_pillars.base.settings import shipped_configs, to_dict
+from asca_pillars.base.schema import to_dict
+from asca_pillars.base.settings import shipped_configs
 from asca_pillars.config.tree import Config, load_config
 from asca_pillars.data.boxes.box_records import read_frame_file, read_frames, read_time
 from asca_pillars.data.kitti import KittiSplit, boxes_from_objects, objects_3d, read_calibration, read_labels

@@ -20,7 +20,7 @@ from asca_deploy.result_files import ResultWriter
 from asca_pillars.base.errors import AscaError, OutputError
 from asca_pillars.base.files import require_writable
 from asca_pillars.base.own_files import page_end
-from asca_pillars.base.settings import to_dict
+from asca_pillars.base.schema import to_dict
 from asca_pillars.base.system import describe_environment
 from asca_pillars.cluster import Shard, ShardFolder
 from asca_pillars.config.tree import Config, load_config

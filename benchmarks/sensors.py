@@ -21,7 +21,7 @@ from rich.progress import track
 
 from asca_deploy import Detections, Detector
 from asca_pillars.base.errors import AscaError
-from asca_pillars.base.settings import parse
+from asca_pillars.base.schema import parse
 from asca_pillars.cli.run_command import run_command
 from asca_pillars.data.kitti import KittiSplit, boxes_from_objects, objects_3d
 from asca_pillars.detection.targets import match_by_overlap

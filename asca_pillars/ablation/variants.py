@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from dataclasses import astuple, dataclass, replace
 from typing import Any, NamedTuple, Protocol
 
-from asca_pillars.base.settings import to_dict
+from asca_pillars.base.schema import to_dict
 from asca_pillars.config.pillar import PillarModel
 from asca_pillars.config.pv_rcnn import Attention, Gate, PvRcnnModel
 from asca_pillars.detection.anchors import KITTI_CLASSES

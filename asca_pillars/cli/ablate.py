@@ -66,7 +66,7 @@ def ablate(
     from asca_pillars.base.files import write_text
     from asca_pillars.base.own_files import page_end
     from asca_pillars.base.progress import Reporter
-    from asca_pillars.base.settings import to_dict
+    from asca_pillars.base.schema import to_dict
     from asca_pillars.base.system import default_threads
     from asca_pillars.cli.ablate_steps import (
         COMMAND,

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from asca_pillars.base.errors import ConfigError, OutputError, TrainingError
 from asca_pillars.base.files import WEIGHTS_FILE, atomic_path, require_content
-from asca_pillars.base.settings import parse
+from asca_pillars.base.schema import parse
 from asca_pillars.config.tree import Config
 from asca_pillars.scans.input_check import ExpectedInput
 

@@ -16,7 +16,8 @@ from asca_pillars.base.files import write_text
 from asca_pillars.base.own_files import json_object, require_no_link, require_own, require_own_file
 from asca_pillars.base.processes import map_in_processes
 from asca_pillars.base.progress import Reporter
-from asca_pillars.base.settings import parse, read_settings, shipped_configs
+from asca_pillars.base.schema import parse
+from asca_pillars.base.settings import read_settings, shipped_configs
 from asca_pillars.base.strict import Strict
 from asca_pillars.cluster import run_items
 from asca_pillars.data.kitti import (

@@ -14,7 +14,7 @@ from torch.optim.swa_utils import update_bn
 
 from asca_pillars.base.errors import ConfigError
 from asca_pillars.base.progress import SILENT, Reporter
-from asca_pillars.base.settings import to_dict
+from asca_pillars.base.schema import to_dict
 from asca_pillars.detection.spec import DetectorSpec
 from asca_pillars.models.build import build_model
 from asca_pillars.models.checkpoint_file import read_checkpoint, read_plain, require_same_arrays, write_plain

@@ -13,7 +13,7 @@ from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LambdaLR, OneCycleLR, StepLR
 
 from asca_pillars.base.errors import AscaError, TrainingError
-from asca_pillars.base.settings import to_dict
+from asca_pillars.base.schema import to_dict
 from asca_pillars.config.tree import Config, Precision, TrainConfig
 from asca_pillars.evaluation.recall import RecallTally
 from asca_pillars.models.build import build_model

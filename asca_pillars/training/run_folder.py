@@ -12,7 +12,8 @@ from asca_pillars.base.errors import TrainingError
 from asca_pillars.base.files import write_json, write_text
 from asca_pillars.base.own_files import require_own_file
 from asca_pillars.base.progress import SILENT, Reporter
-from asca_pillars.base.settings import read_settings, to_dict
+from asca_pillars.base.schema import to_dict
+from asca_pillars.base.settings import read_settings
 from asca_pillars.base.system import describe_environment
 from asca_pillars.config.tree import Config, Precision, load_config
 from asca_pillars.data.augment import TrainingFrames

@@ -30,7 +30,7 @@ from asca_pillars.base.files import atomic_path
 from asca_pillars.base.installation import require
 from asca_pillars.base.own_files import json_object, require_own
 from asca_pillars.base.progress import Progress, Remark, Reporter
-from asca_pillars.base.settings import to_dict
+from asca_pillars.base.schema import to_dict
 from asca_pillars.base.system import package_versions
 from asca_pillars.cluster import RUN_SETTINGS, Shard, ShardFolder, make_shards, run_shards
 from asca_pillars.data.boxes.detector_scope import detector_scope

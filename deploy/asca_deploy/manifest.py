@@ -29,7 +29,7 @@ from asca_deploy.bundle import (
 from asca_pillars.base.errors import AscaError, BundleError, printable
 from asca_pillars.base.files import require_content, write_json
 from asca_pillars.base.installation import upgrade_advice
-from asca_pillars.base.settings import parse, to_dict
+from asca_pillars.base.schema import parse, to_dict
 from asca_pillars.detection.anchors import ANCHOR_YAWS_RAD
 from asca_pillars.geometry.boxes import DIRECTION_OFFSET_RAD
 from asca_pillars.ops.pillar.prepare import FEATURES

@@ -16,7 +16,7 @@ from asca_pillars.ablation.ablation_runs import Speed, finish_runs, runs, tables
 from asca_pillars.ablation.variants import PILLARS, VARIANTS
 from asca_pillars.base.errors import AscaError, TrainingError
 from asca_pillars.base.own_files import written_by
-from asca_pillars.base.settings import to_dict
+from asca_pillars.base.schema import to_dict
 from asca_pillars.cli import ablate_steps
 from asca_pillars.cli.ablate import ablate
 from asca_pillars.config.tree import load_config, pillar_spec

@@ -11,7 +11,8 @@ import yaml
 
 from asca_pillars.ablation.variants import BASE, TWO_STAGE, VARIANTS, Variant
 from asca_pillars.base.errors import ConfigError, TrainingError
-from asca_pillars.base.settings import shipped_configs, to_dict
+from asca_pillars.base.schema import to_dict
+from asca_pillars.base.settings import shipped_configs
 from asca_pillars.cli.ablate import ablate
 from asca_pillars.cli.ablate_steps import check, family_of, parse_variants
 from asca_pillars.config.pillar import PillarModel

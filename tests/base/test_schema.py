@@ -7,7 +7,7 @@ import pytest
 from pydantic import Discriminator, Tag
 
 from asca_pillars.base.errors import ConfigError
-from asca_pillars.base.settings import parse, to_dict
+from asca_pillars.base.schema import parse, to_dict
 from asca_pillars.base.strict import Strict
 
 

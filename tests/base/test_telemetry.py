@@ -18,7 +18,7 @@ import pytest
 import yaml
 
 from asca_deploy import onnx_runtime
-from asca_pillars.base.settings import to_dict
+from asca_pillars.base.schema import to_dict
 from asca_pillars.base.telemetry import onnxruntime_may_report
 from tests.helpers import socket_filter
 from tests.helpers.bundles import DENSE_INT8

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from asca_pillars.base.settings import to_dict
+from asca_pillars.base.schema import to_dict
 from benchmarks.training_cost import main
 from tests.helpers.config_files import write
 from tests.helpers.scenes import write_dataset

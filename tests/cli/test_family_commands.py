@@ -10,7 +10,7 @@ import yaml
 from asca_deploy import detect_archive
 from asca_export.pv_rcnn import int8
 from asca_pillars.base.errors import ConfigError
-from asca_pillars.base.settings import to_dict
+from asca_pillars.base.schema import to_dict
 from asca_pillars.cli.detect import detect
 from asca_pillars.cli.inspect import inspect
 from asca_pillars.cli.train import prepare

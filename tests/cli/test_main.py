@@ -16,7 +16,7 @@ from typer.main import get_command
 
 from asca_deploy import Detector, sample_scan_path
 from asca_pillars.base.installation import install_command
-from asca_pillars.base.settings import to_dict
+from asca_pillars.base.schema import to_dict
 from asca_pillars.cli.main import app
 from asca_pillars.scans.scan_reader import read_scan, write_scan
 from tests.helpers.hidden_modules import hiding

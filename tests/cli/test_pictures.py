@@ -9,7 +9,7 @@ import pytest
 import yaml
 
 from asca_pillars.base.errors import ConfigError, OutputError
-from asca_pillars.base.settings import to_dict
+from asca_pillars.base.schema import to_dict
 from asca_pillars.config.pillar import PillarModel
 from asca_pillars.config.tree import Config, DataConfig
 from asca_pillars.data.augment import open_frames

@@ -12,7 +12,8 @@ import torch
 import yaml
 
 from asca_pillars.base.errors import ConfigError
-from asca_pillars.base.settings import parse, shipped_configs, to_dict
+from asca_pillars.base.schema import parse, to_dict
+from asca_pillars.base.settings import shipped_configs
 from asca_pillars.config.pillar import LossConfig, PillarModel
 from asca_pillars.config.tree import Config, TrainConfig, load_config, pillar_spec
 from asca_pillars.detection.anchors import ClassSpec

@@ -31,7 +31,7 @@ from asca_deploy.manifest import (
     write_bundle_manifest,
 )
 from asca_pillars.base.errors import BundleError
-from asca_pillars.base.settings import to_dict
+from asca_pillars.base.schema import to_dict
 from asca_pillars.ops.pillar.grid import PillarGrid
 from asca_pillars.ops.pillar.prepare import FEATURES
 from asca_pillars.ops.pillar.spec import PillarSpec

@@ -5,7 +5,7 @@ from typing import Any
 
 import torch
 
-from asca_pillars.base.settings import to_dict
+from asca_pillars.base.schema import to_dict
 from asca_pillars.models.build import Checkpoint
 
 

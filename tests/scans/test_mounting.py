@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from asca_pillars.base.errors import ConfigError
-from asca_pillars.base.settings import parse, to_dict
+from asca_pillars.base.schema import parse, to_dict
 from asca_pillars.scans.mounting import Mounting, read_pose
 
 POINT = np.array([[3.0, 5.0, -1.0, 0.4]], np.float32)

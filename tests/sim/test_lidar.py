@@ -7,7 +7,7 @@ import pytest
 import yaml
 
 from asca_pillars.base.errors import ConfigError
-from asca_pillars.base.settings import parse
+from asca_pillars.base.schema import parse
 from asca_pillars.sim.bodies.primitives import Surface, quads
 from asca_pillars.sim.casting.raycast import Bodies, cast
 from asca_pillars.sim.lidar import Lidar, draw_firings

@@ -13,7 +13,7 @@ from asca_deploy import shipped
 from asca_deploy.shipped import find_checkpoint
 from asca_pillars.base import installation
 from asca_pillars.base.errors import BundleError, TrainingError
-from asca_pillars.base.settings import to_dict
+from asca_pillars.base.schema import to_dict
 from asca_pillars.config.pillar import PillarModel
 from asca_pillars.models.build import Checkpoint, build_model, load_checkpoint
 from asca_pillars.models.checkpoint_file import save_weights

@@ -16,7 +16,7 @@ import torch
 import yaml
 
 from asca_pillars.base.errors import ScanError, TrainingError
-from asca_pillars.base.settings import to_dict
+from asca_pillars.base.schema import to_dict
 from asca_pillars.config.pillar import CpaReading, PillarModel
 from asca_pillars.config.pv_rcnn import PvRcnnModel
 from asca_pillars.config.tree import DataConfig, TrainConfig

@@ -11,7 +11,7 @@ import yaml
 
 from asca_pillars.base.errors import ConfigError, DatasetError, OutputError, TrainingError
 from asca_pillars.base.locks import only_writer
-from asca_pillars.base.settings import to_dict
+from asca_pillars.base.schema import to_dict
 from asca_pillars.base.system import describe_environment
 from asca_pillars.config.tree import Config, DataConfig, TrainConfig
 from asca_pillars.data.kitti import KittiSplit

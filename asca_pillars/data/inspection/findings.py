@@ -13,7 +13,7 @@ import yaml
 from asca_pillars.base.errors import DatasetError, OutputError
 from asca_pillars.base.files import write_text
 from asca_pillars.base.progress import SILENT, Reporter
-from asca_pillars.base.settings import to_dict
+from asca_pillars.base.schema import to_dict
 from asca_pillars.config.tree import Config
 from asca_pillars.data.frames import LabeledSplit, other_spelling
 from asca_pillars.data.inspection.inspect_dataset import ClassFacts, Inspection, ScanFacts

@@ -14,7 +14,7 @@ from asca_pillars.base.errors import ConfigError, DatasetError
 from asca_pillars.base.files import write_json, write_text
 from asca_pillars.base.own_files import Recognizer, ending_with, json_object, page_end, require_own_file
 from asca_pillars.base.progress import Reporter
-from asca_pillars.base.settings import parse, to_dict
+from asca_pillars.base.schema import parse, to_dict
 from asca_pillars.base.strict import Strict
 from asca_pillars.data.kitti.kitti_split import read_image_set
 from asca_pillars.evaluation.errors.box_errors import CORRECTIONS, FALSE_KINDS, LOCALIZATION_IOU, TRAITS, least_iou

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from asca_pillars.base.errors import ConfigError, TrainingError
 from asca_pillars.base.files import require_content
-from asca_pillars.base.settings import to_dict
+from asca_pillars.base.schema import to_dict
 from asca_pillars.config.pillar import PillarModel
 from asca_pillars.config.pv_rcnn import PvRcnnModel
 from asca_pillars.config.tree import Config

@@ -13,7 +13,7 @@ from torch import Tensor
 from asca_pillars.base.errors import BundleError, ConfigError
 from asca_pillars.base.files import WEIGHTS_FILE, read_text, require_content
 from asca_pillars.base.installation import find_shipped
-from asca_pillars.base.settings import parse
+from asca_pillars.base.schema import parse
 from asca_pillars.config.pillar import PillarModel
 from asca_pillars.config.tree import Config
 from asca_pillars.detection.decode import PostProcess

@@ -17,7 +17,7 @@ from torch import Tensor
 from asca_pillars.base.errors import DatasetError
 from asca_pillars.base.processes import map_in_processes
 from asca_pillars.base.progress import SILENT, Reporter
-from asca_pillars.base.settings import to_dict
+from asca_pillars.base.schema import to_dict
 from asca_pillars.config.tree import DataConfig
 from asca_pillars.config.two_stage import RefineConfig, RefineModel
 from asca_pillars.data.augment import move_scene

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from functools import cache
 from importlib import resources
 
-from asca_pillars.base.settings import parse
+from asca_pillars.base.schema import parse
 from asca_pillars.base.strict import Strict
 
 CLASSES = ("Car", "Pedestrian", "Cyclist")

@@ -12,7 +12,7 @@ from rich.table import Table
 
 from asca_pillars.base.files import write_json, write_text
 from asca_pillars.base.own_files import page_end
-from asca_pillars.base.settings import to_dict
+from asca_pillars.base.schema import to_dict
 from asca_pillars.evaluation.report_page import markdown_table
 from asca_pillars.sim.report.comparison import Comparison, Row
 from asca_pillars.sim.report.reference import CAR_FIT_RANGE_M, NEAR_CARS_M, Fit

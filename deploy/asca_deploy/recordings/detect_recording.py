@@ -37,7 +37,7 @@ from asca_pillars.base.errors import ConfigError, ScanError
 from asca_pillars.base.files import atomic_path
 from asca_pillars.base.installation import require
 from asca_pillars.base.progress import Progress, Remark, Reporter
-from asca_pillars.base.settings import to_dict
+from asca_pillars.base.schema import to_dict
 from asca_pillars.data.boxes.detector_scope import DetectorScope, detector_scope
 from asca_pillars.data.kitti import read_calibration
 from asca_pillars.detection.spec import ScoreThresholds

@@ -8,7 +8,7 @@ import pytest
 import yaml
 
 from asca_pillars.base.errors import ConfigError, DatasetError
-from asca_pillars.base.settings import to_dict
+from asca_pillars.base.schema import to_dict
 from asca_pillars.cli.train import prepare
 from asca_pillars.config.pillar import PillarModel
 from asca_pillars.config.tree import Config, DataConfig, InsertConfig, pillar_spec

@@ -9,7 +9,7 @@ import pytest
 import yaml
 
 from asca_pillars.base.errors import AscaError, DatasetError, OutputError
-from asca_pillars.base.settings import parse
+from asca_pillars.base.schema import parse
 from asca_pillars.config.pillar import PillarModel
 from asca_pillars.config.tree import Config, DataConfig, load_config, pillar_spec
 from asca_pillars.data.boxes.box_records import json_line, read_frames, records_from

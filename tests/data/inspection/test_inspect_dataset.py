@@ -13,7 +13,7 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from asca_pillars.base.settings import to_dict
+from asca_pillars.base.schema import to_dict
 from asca_pillars.cli.inspect import inspect
 from asca_pillars.config.pillar import LossConfig, PillarModel
 from asca_pillars.config.tree import Config, pillar_spec

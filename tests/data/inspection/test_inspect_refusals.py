@@ -9,7 +9,7 @@ import pytest
 import yaml
 
 from asca_pillars.base.errors import DatasetError, OutputError
-from asca_pillars.base.settings import to_dict
+from asca_pillars.base.schema import to_dict
 from asca_pillars.cli.inspect import inspect
 from asca_pillars.config.tree import Config, pillar_spec
 from asca_pillars.data.inspection.findings import findings

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from asca_pillars.base.settings import shipped_configs, to_dict
+from asca_pillars.base.schema import to_dict
+from asca_pillars.base.settings import shipped_configs
 from asca_pillars.cli.inspect import inspect
 from asca_pillars.config.tree import Config, load_config
 from asca_pillars.data.boxes.box_split import BoxSplit
