@@ -15,9 +15,9 @@ from asca_pillars.base.installation import install_command, missing_modules
 from asca_pillars.base.own_files import is_own_picture, require_own_file
 from asca_pillars.base.progress import Reporter
 from asca_pillars.base.system import describe_environment
-from asca_pillars.data.boxes.box_records import check_yaws
 from asca_pillars.data.frames import LabeledSplit
 from asca_pillars.data.kitti import KittiSplit
+from asca_pillars.data.yaw_units import check_yaws
 from asca_pillars.detection.spec import ScoreThresholds
 from asca_pillars.evaluation import report_files
 from asca_pillars.evaluation.arguments import (

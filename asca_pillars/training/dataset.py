@@ -20,11 +20,11 @@ from asca_pillars.base.errors import AscaError, DatasetError, WorkerError
 from asca_pillars.base.progress import SILENT, Reporter
 from asca_pillars.config.tree import Config
 from asca_pillars.data.augment import TrainingFrames, open_frames
-from asca_pillars.data.boxes.box_records import check_yaws
 from asca_pillars.data.frames import LabeledFrame, LabeledSplit, other_spelling, read_frame, within_ranges
 from asca_pillars.data.insertion.free_space import prepare_free_spaces
 from asca_pillars.data.insertion.insert_objects import Inserter, prepare_inserter
 from asca_pillars.data.open_split import open_split
+from asca_pillars.data.yaw_units import check_yaws
 from asca_pillars.models.build import build_preparation
 from asca_pillars.models.trainable import Preparation, to_device
 

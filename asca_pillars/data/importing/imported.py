@@ -18,9 +18,10 @@ from asca_pillars.base.errors import ConfigError, DatasetError, OutputError
 from asca_pillars.base.files import atomic_path, file_inside, write_text
 from asca_pillars.base.own_files import json_lines, require_own, require_own_file, starting_with
 from asca_pillars.base.schema import parse, to_dict
-from asca_pillars.data.boxes.box_records import BoxRecords, can_be_written, check_yaws, json_line, records_from
+from asca_pillars.data.boxes.box_records import BoxRecords, can_be_written, json_line, records_from
 from asca_pillars.data.boxes.box_split import DATASET_FILE, BoxDataset, find_frames, frame_id_of
 from asca_pillars.data.kitti import write_image_set
+from asca_pillars.data.yaw_units import check_yaws
 from asca_pillars.scans.find_scans import natural_order
 
 _LARGEST = 1e9  # of any length or angle

@@ -17,7 +17,6 @@ from pathlib import Path
 
 from asca_pillars.base.errors import DatasetError
 from asca_pillars.base.files import read_text
-from asca_pillars.data.boxes.box_records import yaw_error
 from asca_pillars.data.importing.imported import Imported, entry
 from asca_pillars.data.importing.tool_labels import (
     COLORS,
@@ -31,6 +30,7 @@ from asca_pillars.data.importing.tool_labels import (
     track_numbers,
     xyz,
 )
+from asca_pillars.data.yaw_units import yaw_error
 from asca_pillars.scans.find_scans import files_below
 from asca_pillars.scans.scan_settings import ScanSettings
 

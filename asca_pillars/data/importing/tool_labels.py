@@ -15,10 +15,11 @@ from asca_pillars.base.errors import ConfigError, DatasetError, OutputError
 from asca_pillars.base.files import is_hidden, read_text, write_json, write_text
 from asca_pillars.base.own_files import json_object, require_no_link, require_own_file
 from asca_pillars.base.schema import parse, to_dict
-from asca_pillars.data.boxes.box_records import BoxRecords, read_frames, records_from, yaw_error
+from asca_pillars.data.boxes.box_records import BoxRecords, read_frames, records_from
 from asca_pillars.data.boxes.box_split import BoxDataset, find_frames
 from asca_pillars.data.importing.formats import FORMATS, TOOLS
 from asca_pillars.data.importing.imported import Imported, ImportedFrame, SkippedEntries, entry, numbers, text_of
+from asca_pillars.data.yaw_units import yaw_error
 from asca_pillars.geometry.boxes import wrap_angle
 from asca_pillars.scans.find_scans import SCAN_SUFFIXES, files_below, find_scans, natural_order
 from asca_pillars.scans.scan_settings import ScanSettings

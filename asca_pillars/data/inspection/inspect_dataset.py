@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from asca_pillars.base.errors import DatasetError, ScanError
 from asca_pillars.base.progress import SILENT, Reporter
 from asca_pillars.config.tree import DataConfig
-from asca_pillars.data.boxes.box_records import check_yaws
 from asca_pillars.data.frames import LabeledSplit
 from asca_pillars.data.inspection.measurements import (
     ConventionFit,
@@ -27,6 +26,7 @@ from asca_pillars.data.inspection.measurements import (
     measure_frame,
 )
 from asca_pillars.data.kitti import KittiSplit
+from asca_pillars.data.yaw_units import check_yaws
 from asca_pillars.detection.anchors import ClassSpec
 from asca_pillars.detection.targets import Assigner
 from asca_pillars.geometry.overlap import aligned_bev_iou

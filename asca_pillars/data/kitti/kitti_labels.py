@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from asca_pillars.base.errors import DatasetError
 from asca_pillars.base.files import atomic_path, read_text
-from asca_pillars.data.boxes.box_records import yaw_error
 from asca_pillars.data.kitti.calibration import DEFAULT_IMAGE_SIZE_WH, Calibration, image_boxes
+from asca_pillars.data.yaw_units import yaw_error
 from asca_pillars.geometry.boxes import wrap_angle
 
 _TOO_LARGE = 1e9  # of any field; float32 boxes of larger numbers are not finite

@@ -16,9 +16,10 @@ from hypothesis import strategies as st
 from asca_pillars.base.errors import DatasetError
 from asca_pillars.config.pillar import PillarModel
 from asca_pillars.config.tree import Config, DataConfig
-from asca_pillars.data.boxes.box_records import check_yaws, json_line, read_frame_file, read_frames, records_from
+from asca_pillars.data.boxes.box_records import json_line, read_frame_file, read_frames, records_from
 from asca_pillars.data.kitti import parse_object, read_labels
 from asca_pillars.data.open_split import open_split
+from asca_pillars.data.yaw_units import check_yaws
 from asca_pillars.geometry.boxes import wrap_angle
 from asca_pillars.training.dataset import require_boxes
 from tests.data.boxes.box_scenes import write_box_dataset
