@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from asca_pillars.data.kitti import Calibration
-from asca_pillars.sim.bodies import people, primitives, vehicles
+from asca_pillars.sim.bodies import people, primitives, styles, vehicles
 from asca_pillars.sim.bodies.primitives import BACKGROUND, Primitives
 from asca_pillars.sim.casting.raycast import Bodies
 from asca_pillars.sim.scene_config import SceneConfig
@@ -128,7 +128,7 @@ def body_of(target: Target, config: SceneConfig, rng: np.random.Generator) -> Pr
     if name in ("Car", "Van"):
         # Annotators fit boxes to many scans of a car: their faces are a few centimetres off the body, on either side.
         slack = rng.uniform((-0.08, -0.04, -0.05), (0.12, 0.10, 0.06))
-        profile = vehicles.draw_style(rng, length, height, van=name == "Van")
+        profile = styles.draw_style(rng, length, height, van=name == "Van")
         dark = config.dark_paint_share if name == "Car" else 0.1
         body = vehicles.car_body(rng, length - slack[0], width - slack[1], height - slack[2], profile, dark, footprint)
     elif name == "Truck":

@@ -5,7 +5,6 @@ import dataclasses
 import numpy as np
 import pytest
 
-from asca_pillars.evaluation.errors.error_report import error_notes, error_tables, group_tables
 from asca_pillars.evaluation.errors.error_summary import (
     ALL,
     CLEAR,
@@ -18,6 +17,7 @@ from asca_pillars.evaluation.errors.error_summary import (
     match_frames,
     summarize,
 )
+from asca_pillars.evaluation.errors.error_tables import error_notes, error_tables, group_tables
 from tests.evaluation.errors.made_frames import GROUND_Z_M, MadeFrames, column, frame, ground
 
 WALKER = np.array([12.0, 0.0, GROUND_Z_M + 0.88, 0.8, 0.6, 1.75, 0.0])

@@ -8,7 +8,8 @@ import pytest
 from asca_pillars.geometry.boxes import corners
 from asca_pillars.sim.bodies.people import motorbike_body, parked_bicycle_body
 from asca_pillars.sim.bodies.primitives import Primitives, cuboids, ellipsoids, limbs, prisms
-from asca_pillars.sim.bodies.vehicles import HATCHBACK, Profile, car_body, draw_style
+from asca_pillars.sim.bodies.styles import HATCHBACK, Profile, draw_style
+from asca_pillars.sim.bodies.vehicles import car_body
 from asca_pillars.sim.scene_config import SceneConfig
 from asca_pillars.sim.world.placement import SIZES, Target, draw_size
 from asca_pillars.sim.world.scene import body_of

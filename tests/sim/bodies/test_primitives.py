@@ -4,7 +4,8 @@ import numpy as np
 
 from asca_pillars.sim.bodies.people import cyclist_body
 from asca_pillars.sim.bodies.primitives import Primitives, darkened, scaled, warped
-from asca_pillars.sim.bodies.vehicles import HATCHBACK, car_body
+from asca_pillars.sim.bodies.styles import HATCHBACK
+from asca_pillars.sim.bodies.vehicles import car_body
 
 
 def bodies() -> list[Primitives]:

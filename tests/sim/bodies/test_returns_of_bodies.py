@@ -9,7 +9,8 @@ import pytest
 
 from asca_pillars.evaluation.errors.label_fit import label_fit
 from asca_pillars.sim.bodies.people import SHARES, bicycle, cyclist_body, draw_burden, pedestrian_body
-from asca_pillars.sim.bodies.vehicles import car_body, draw_style
+from asca_pillars.sim.bodies.styles import draw_style
+from asca_pillars.sim.bodies.vehicles import car_body
 from asca_pillars.sim.report.scan_statistics import COLUMNS, WINDOW_RETURNS, window_returns
 from asca_pillars.sim.scene_config import SceneConfig
 from asca_pillars.sim.world.placement import Target

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from asca_pillars.sim.bodies.primitives import BACKGROUND, Primitives, Surface, cuboids, ellipsoids, prisms, quads
-from asca_pillars.sim.bodies.vehicles import SALOON, car_body
+from asca_pillars.sim.bodies.styles import SALOON
+from asca_pillars.sim.bodies.vehicles import car_body
 from asca_pillars.sim.casting.groundcast import GROUND
 from asca_pillars.sim.casting.raycast import NOTHING, Bodies, cast
 from asca_pillars.sim.lidar import Firings, Lidar, draw_firings
