@@ -33,7 +33,7 @@ def pad_rows(features: Tensor, value: float = 0) -> Tensor:
 
 
 def linear_rows(features: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
-    """Apply `torch.nn.functional.linear` to rows, unitless: (N, C) -> (N, outputs)."""
+    """Apply `torch.nn.functional.linear` to rows: (N, C) -> (N, outputs)."""
     device = features.device.type
     if device != "cpu" or not torch.is_autocast_enabled(device):
         return F.linear(features, weight, bias)
@@ -50,7 +50,7 @@ def rulebook_conv(features: Tensor, weight: Tensor, table: Tensor, back: Tensor 
     Under autocast it computes in the lower precision, as a convolution would.
 
     Args:
-        features: (N, C), unitless.
+        features: (N, C).
         weight: (outputs, C, *kernel) as PyTorch stores a convolution's, K cells in its kernel.
         table: (M, K) int32 rows of `features`, N where there is none.
         back: (N, K) int32 the inverse, rows of the output, M where there is none; needed for the features' gradient.
@@ -118,7 +118,7 @@ def _chunks(features: Tensor, table: Tensor) -> Iterator[tuple[int, Tensor]]:
 
 
 def at_active_cells(norm: Callable[[Tensor], Tensor], features: Tensor) -> Tensor:
-    """Apply a batch normalization of maps or volumes to active cells: (M, C) -> (M, C), unitless."""
+    """Apply a batch normalization of maps or volumes to active cells: (M, C) -> (M, C)."""
     return norm(features[:, :, None, None])[:, :, 0, 0]
 
 
@@ -191,7 +191,7 @@ class MapBackbone(nn.Module):
         self.out_channels = upsample_channels * len(self.blocks)
 
     def forward(self, canvas: Tensor) -> Tensor:
-        """Apply the blocks: unitless (B, C, H, W) -> (B, out_channels, h, w), with h, w = H, W / head_stride."""
+        """Apply the blocks: (B, C, H, W) -> (B, out_channels, h, w), with h, w = H, W / head_stride."""
         maps, attention = [], self.attention or [nn.Identity()] * len(self.blocks)
         for block, attend, deblock in zip(self.blocks, attention, self.deblocks, strict=True):
             canvas = attend(block(canvas))

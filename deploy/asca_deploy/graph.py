@@ -35,7 +35,7 @@ class Session(Protocol):
     def run(self) -> Callable[[Sequence[str], Mapping[str, NDArray[Any]]], list[NDArray[Any]]]:
         """(names of outputs, inputs by name) -> these outputs, in that order; the arrays are the caller's to keep.
 
-        Shapes are those that `inputs` and `outputs` declare, values unitless. Several threads may call it.
+        Shapes are those that `inputs` and `outputs` declare. Several threads may call it.
         """
 
 

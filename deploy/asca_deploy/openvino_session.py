@@ -83,7 +83,7 @@ class OpenVinoSession:
     def run(self, outputs: Sequence[str], inputs: Mapping[str, NDArray[Any]]) -> list[NDArray[Any]]:
         """See `graph.Session.run`; OpenVINO writes into new arrays, so that nothing is copied.
 
-        Inputs and outputs are unitless and have the graph's fixed shapes, such as (1, ny + 1, nx + 1, C).
+        Inputs and outputs have the graph's fixed shapes, such as (1, ny + 1, nx + 1, C).
 
         Raises:
             ProviderError: OpenVINO fails, for example for want of memory.

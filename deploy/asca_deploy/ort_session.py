@@ -112,7 +112,7 @@ class OrtSession:
         self.outputs = {node.name: _tensor(node) for node in self._session.get_outputs()}
 
     def run(self, outputs: Sequence[str], inputs: Mapping[str, NDArray[Any]]) -> list[NDArray[Any]]:
-        """See `graph.Session.run`: unitless inputs and outputs of the shapes that the graph declares.
+        """See `graph.Session.run`: inputs and outputs of the shapes that the graph declares.
 
         Raises:
             ProviderError: it fails on other hardware than the CPU, for example for want of memory.

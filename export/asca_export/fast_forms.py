@@ -82,7 +82,7 @@ class FastEncoder(nn.Module):
         self.pillar_attention = encode.pillar_attention or nn.Identity()
 
     def forward(self, features: Tensor, pillar_index: Tensor, point_counts: Tensor) -> Tensor:
-        """Point features (M, 9) and their pillars -> unitless pillar features (P, C)."""
+        """Point features (M, 9) and their pillars -> pillar features (P, C)."""
         largest = pillar_max(features @ self.weight, pillar_index, point_counts)
         pillars: Tensor = self.pillar_attention(torch.relu(largest + self.bias))
         return pillars
@@ -160,7 +160,7 @@ class Upsample(nn.Module):
             self.convolution.bias.copy_(fused.bias.repeat(self.stride**2))
 
     def forward(self, features: Tensor) -> Tensor:
-        """Upsample unitless (1, C, H, W) -> (1, stride * H, stride * W, channels)."""
+        """Upsample (1, C, H, W) -> (1, stride * H, stride * W, channels)."""
         upsampled = torch.relu(self.convolution(features)).permute(0, 2, 3, 1)
         if self.stride == 1:
             return upsampled
@@ -219,7 +219,7 @@ class MarkedEncoder(nn.Module):
         self.encode = encode
 
     def forward(self, features: Tensor, pillar_index: Tensor, point_counts: Tensor) -> Tensor:
-        """Point features (M, 9) and their pillars -> unitless pillar features (P, C), see `PillarEncoder`."""
+        """Point features (M, 9) and their pillars -> pillar features (P, C), see `PillarEncoder`."""
         encoded = self.encode(features, pillar_index, point_counts)
         return torch.where(encoded == 0, _LEAST, encoded)
 

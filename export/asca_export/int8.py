@@ -54,7 +54,7 @@ class EncodedScan(NamedTuple):
     pillars: Pillars
 
     def quantize_features(self, steps: CanvasSteps) -> NDArray[np.uint8]:
-        """Return the features in whole steps, (P, C), unitless."""
+        """Return the features in whole steps, (P, C)."""
         scale, empty = steps.scale.numpy(), steps.empty.numpy()
         return np.clip(np.round(self.features / scale + empty), 0, STEPS).astype(np.uint8)
 
@@ -100,7 +100,7 @@ class RoundedMaps:
 
     Args:
         backbone: made with `steps`; changed in place.
-        canvases: (1, H, W, C), unitless, of the calibration scans, each time anew.
+        canvases: (1, H, W, C), of the calibration scans, each time anew.
         steps: of the canvases.
         map_shape: rows and columns of the map.
         work: folder for what is needed on the way.
@@ -192,7 +192,7 @@ def quantize_backbone(template: Path, out: Path, layers: Collection[str], parame
     Args:
         template: `FastBackbone` in ONNX, its activations and canvas in steps.
         layers: some of `quantize.layer_names`.
-        parameters: by name, unitless and of the module's shapes, such as (out, in, 3, 3); the weights of `layers` are
+        parameters: by name, of the module's shapes, such as (out, in, 3, 3); the weights of `layers` are
             rounded.
     """
     model = onnx.shape_inference.infer_shapes(onnx.load(template))

@@ -35,7 +35,7 @@ TINY = 1e-6  # a channel that is never above it is as good as empty; its step mu
 
 
 def canvas_steps(pillar_features: Iterable[NDArray[np.float32]]) -> CanvasSteps:
-    """Return the steps of a canvas for the unitless features of all these scans, (P, C) each, and exactly zero."""
+    """Return the steps of a canvas for the features of all these scans, (P, C) each, and exactly zero."""
     lows, highs = zip(*((features.min(axis=0), features.max(axis=0)) for features in pillar_features), strict=True)
     low, high = np.minimum(np.min(lows, axis=0), 0.0), np.maximum(np.max(highs, axis=0), 0.0)
     scale = np.maximum((high - low) / STEPS, TINY).astype(np.float32)
@@ -98,7 +98,7 @@ def input_moments(backbone: FastBackbone, canvases: Iterable[NDArray[np.uint8]],
 
     Args:
         backbone: scaled to steps.
-        canvases: likewise, unitless.
+        canvases: likewise.
     """
     empty = {name: _center(pass_.input) for name, pass_ in _passes(backbone, _empty_canvas(backbone, steps))}
     generator = torch.Generator().manual_seed(0)
@@ -136,7 +136,7 @@ def round_weights(backbone: FastBackbone, layers: Collection[str], moments: Mome
 
 
 def round_together(weight: Tensor, squares: Tensor) -> Tensor:
-    """Round unitless weights (outputs, n) jointly to a grid of 2 WEIGHT_STEPS + 1 values per output.
+    """Round weights (outputs, n) jointly to a grid of 2 WEIGHT_STEPS + 1 values per output.
 
     The largest weight of an output stays at the end of its grid, from which the graph's writer takes the grid's unit.
     """

@@ -64,7 +64,7 @@ class RowGraph:
         self._outputs.append(helper.make_tensor_value_info(name, kind, [rows, width]))
 
     def gather(self, owner: str, rows: str, missing: NDArray[Any], table: str, taps: int) -> str:
-        """Gather unitless rows by the table (M, taps), the row `missing` (C,) behind the last: (M, taps * C)."""
+        """Gather rows by the table (M, taps), the row `missing` (C,) behind the last: (M, taps * C)."""
         self.add_input(table, TensorProto.INT32, f"{table}_rows", taps)
         padded = self.node("Concat", owner, "padded", rows, self.constant(owner, "missing", missing[None]), axis=0)
         gathered = self.node("Gather", owner, "gathered", padded, table, axis=0)
@@ -107,7 +107,7 @@ class RowGraph:
         self._nodes.append(helper.make_node(kind, list(inputs), list(outputs), name=f"{outputs[0]}.last", **attributes))
 
     def constant(self, owner: str, what: str, value: NDArray[Any]) -> str:
-        """Add a unitless initializer (any shape)."""
+        """Add an initializer (any shape)."""
         name = f"{owner}.{what}"
         self._constants[name] = value
         return name
@@ -215,7 +215,7 @@ class SparseBackbone(nn.Module):
         return product
 
     def passes(self, features: Tensor, rulebooks: NeckRulebooks[Tensor]) -> Iterator[tuple[str, Tensor, Tensor]]:
-        """Yield name, input and output of each product in turn: unitless (P, C), or STEP_VALUE times steps."""
+        """Yield name, input and output of each product in turn: (P, C), or STEP_VALUE times steps."""
         inputs, maps = rulebook_inputs(rulebooks), []
         missing = self.empty * STEP_VALUE
         for level in self.levels:
@@ -248,7 +248,7 @@ def scale_and_shift(norm: nn.BatchNorm1d) -> tuple[Tensor, Tensor]:
 
 
 def linear(weight: Tensor, bias: Tensor | None) -> nn.Linear:
-    """Return a frozen product with this unitless weight (outputs, n) and bias (outputs,)."""
+    """Return a frozen product with this weight (outputs, n) and bias (outputs,)."""
     assert bias is not None
     product = nn.Linear(weight.shape[1], weight.shape[0])
     with torch.no_grad():
@@ -354,7 +354,7 @@ class RowProducts(Protocol):
         """Return the product of this name."""
 
     def passes(self, *sample: Any) -> Iterator[tuple[str, Tensor, Tensor]]:
-        """Yield name, input (M, n) and output (M, outputs) of each product in turn, unitless."""
+        """Yield name, input (M, n) and output (M, outputs) of each product in turn."""
 
 
 Backbone = TypeVar("Backbone", bound=RowProducts)
@@ -450,6 +450,6 @@ def mixed_products(exact: Backbone, rounded: Backbone, eight_bit: Iterable[str])
 
 
 def count_steps(product: nn.Linear, step: Tensor) -> None:
-    """Let the outputs count unitless steps (outputs,), STEP_VALUE for each."""
+    """Let the outputs count steps (outputs,), STEP_VALUE for each."""
     product.weight.mul_(STEP_VALUE / step[:, None])
     product.bias.mul_(STEP_VALUE / step)

@@ -37,12 +37,12 @@ _NAMED = 5  # mismatched names in an error, at most
 
 
 def identity(array: Tensor) -> Tensor:
-    """Return unitless weights (out, in, ...), and arrays of any other shape, unchanged."""
+    """Return weights (out, in, ...), and arrays of any other shape, unchanged."""
     return array
 
 
 def squeeze_kernel(array: Tensor) -> Tensor:
-    """Reshape a 1x1 convolution's unitless weight (out, in, 1, ...) to a linear layer's (out, in)."""
+    """Reshape a 1x1 convolution's weight (out, in, 1, ...) to a linear layer's (out, in)."""
     return array.flatten(1) if array.shape[2:].numel() == 1 else array
 
 
@@ -65,7 +65,7 @@ def convert_state(
     """Convert their state dict to ours; every array of theirs is used, or named in the error.
 
     Args:
-        state: theirs by name: unitless weights (out, in, ...) and the (C,) values of normalizations.
+        state: theirs by name: weights (out, in, ...) and the (C,) values of normalizations.
         key_mappings: what becomes what.
         our_state: our state dict, for names and shapes.
         path_text: the file, for messages.
@@ -113,7 +113,7 @@ def map_backbone_keys(block_convs: Sequence[int], first: Callable[[Tensor], Tens
 
     Args:
         block_convs: convolutions of each block after its first.
-        first: conversion of the very first convolution's unitless weight (out, in, 3, 3), whose input channels may
+        first: conversion of the very first convolution's weight (out, in, 3, 3), whose input channels may
             stand in another order.
     """
     for block, convs in enumerate(block_convs):
@@ -139,7 +139,7 @@ _LAYOUTS = (
 
 
 def dense_order(pairs: Sequence[tuple[Tensor, Tensor]]) -> Callable[[Tensor], Tensor]:
-    """Return the conversion of unitless sparse weights to (out, in, z, y, x), by the layout that fits all of them.
+    """Return the conversion of sparse weights to (out, in, z, y, x), by the layout that fits all of them.
 
     Layers with as many inputs as outputs fit two of the layouts; all layers of a file have the same.
 
@@ -157,7 +157,7 @@ _X_CENTER, _Z_CENTER = FEATURES.index("x_center"), len(FEATURES)  # the last is 
 
 
 def pointpillars_keys(model: PillarModel, state: Mapping[str, Tensor]) -> Iterator[KeyMapping]:
-    """Yield the mappings for `build_pillar_detector(model)` from `state`, OpenPCDet's unitless weights (out, in, ...).
+    """Yield the mappings for `build_pillar_detector(model)` from `state`, OpenPCDet's weights (out, in, ...).
 
     Raises:
         TrainingError: points with other features.
@@ -173,7 +173,7 @@ def encoder_keys(
 
     Args:
         model: ours.
-        state: their unitless weights (out, in, ...) by name.
+        state: their weights (out, in, ...) by name.
         layer: their name of it.
         legacy: whether the offsets to the pillar's center also stand in the place of x, y and z.
 
@@ -226,7 +226,7 @@ def pv_rcnn_keys(
 
     Args:
         model: ours.
-        state: their unitless weights (out, in, ...) by name.
+        state: their weights (out, in, ...) by name.
         our_state: ours, likewise.
     """
     yield from _voxel_keys(state, our_state)
@@ -377,7 +377,7 @@ def mmdetection3d_keys(
 
     Args:
         model: ours.
-        state: their unitless weights (out, in, ...) by name.
+        state: their weights (out, in, ...) by name.
         our_state: ours, likewise.
         legacy: their encoder's flag of that name, see `encoder_keys`; true unless a configuration says otherwise.
 

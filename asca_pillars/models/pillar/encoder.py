@@ -43,7 +43,7 @@ class PaperAttention(nn.Module):
         self.restore = nn.Parameter(torch.empty(channels, max_pillars).uniform_(-bound, bound))
 
     def forward(self, features: Tensor) -> Tensor:
-        """Apply the attention: unitless features (P, C) -> (P, C) for the pillars of one frame, P <= max_pillars."""
+        """Apply the attention: features (P, C) -> (P, C) for the pillars of one frame, P <= max_pillars."""
         pillars = features.shape[0]
         by_channel = features.T  # F of the paper, (C, P)
         query = by_channel @ self.query[:pillars] + self.bias["query"]  # (C, d)
@@ -61,10 +61,10 @@ class _ChannelMixing(nn.Module, ABC):
 
     @abstractmethod
     def mixing(self, features: Tensor) -> Tensor:
-        """Return the mixing matrix (C, C) of the pillars (P, C) of one frame, unitless."""
+        """Return the mixing matrix (C, C) of the pillars (P, C) of one frame."""
 
     def forward(self, features: Tensor) -> Tensor:
-        """Apply the attention: unitless features (P, C) -> (P, C) for the pillars of one frame."""
+        """Apply the attention: features (P, C) -> (P, C) for the pillars of one frame."""
         device = features.device.type
         if torch.is_autocast_enabled(device):  # differences of large sums: bfloat16 would leave little of them
             with torch.autocast(device, enabled=False):
@@ -88,7 +88,7 @@ class ChannelLinear(_ChannelMixing):
         nn.init.zeros_(self.restore.bias)
 
     def mixing(self, features: Tensor) -> Tensor:
-        """Return the mixing matrix (C, C), unitless, which does not depend on the features (P, C)."""
+        """Return the mixing matrix (C, C), which does not depend on the features (P, C)."""
         return self.restore.weight
 
 
@@ -112,7 +112,7 @@ class ChannelAttention(_ChannelMixing):
         self.temperature = nn.Parameter(torch.ones(1))
 
     def mixing(self, features: Tensor) -> Tensor:
-        """Return the mixing matrix (C, C) of the pillars (P, C) of one frame, unitless."""
+        """Return the mixing matrix (C, C) of the pillars (P, C) of one frame."""
         gram = features.T @ features  # (C, C)
         query, key = self.query.weight, self.key.weight
         products = query @ gram @ key.T  # products of queries and keys, summed over the pillars
@@ -143,7 +143,7 @@ class PointAttention(nn.Module):
         """Apply the attention: (M, C) point features -> (M, C); points attend to the points of their own pillar only.
 
         Args:
-            features: (M, C), unitless, rows of one pillar adjacent.
+            features: (M, C), rows of one pillar adjacent.
             pillar_index: (M,) index of each row's pillar, ascending.
             point_counts: (P,) rows of each pillar.
         """
@@ -174,7 +174,7 @@ def _(features: Tensor, pillar_index: Tensor, point_counts: Tensor) -> Tensor:
 
 
 def pillar_max(features: Tensor, pillar_index: Tensor, point_counts: Tensor) -> Tensor:
-    """Return the channel-wise maximum over the points of each pillar: unitless features (M, C) -> (P, C).
+    """Return the channel-wise maximum over the points of each pillar: features (M, C) -> (P, C).
 
     Points lie flat, without padding, so only real points are compared. While a graph is exported the reduction is
     one named operator, because the exporter has no segment reduction (asca_export.graphs translates it).
@@ -221,7 +221,7 @@ class PillarEncoder(nn.Module):
         point_counts: Tensor,
         frame_pillars: Sequence[int] | None = None,
     ) -> Tensor:
-        """Point features (M, 9) -> pillar features (P, C), which are unitless.
+        """Point features (M, 9) -> pillar features (P, C).
 
         Args:
             features: (M, 9) decorated points, see `ops.pillar.prepare.FEATURES`.

@@ -41,7 +41,7 @@ class LossTerms(NamedTuple):
 
     @property
     def total(self) -> Tensor:
-        """Total loss, eq. (15), a unitless scalar."""
+        """Total loss, eq. (15), a scalar."""
         return self.box + self.classification + self.direction
 
 

@@ -41,7 +41,7 @@ class SparseRPNNeck(MapBackbone):
         self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
     def forward(self, pillars: Tensor, rulebooks: NeckRulebooks[Tensor]) -> Tensor:  # type: ignore[override]
-        """Apply the neck: unitless features of pillars (P, C) -> (M, out_channels) at M active head cells."""
+        """Apply the neck: features of pillars (P, C) -> (M, out_channels) at M active head cells."""
         maps = []
         for block, deblock, level in zip(self.blocks, self.deblocks, rulebooks.levels, strict=True):
             for number, (convolution, norm) in enumerate(block_layers(block)):

@@ -75,7 +75,7 @@ class PillarDetector(Trainable):
         return self.read_head(self.head_input(batch), batch)
 
     def head_input(self, batch: PillarBatch) -> Tensor:
-        """Return the neck's output: unitless (B, C, H, W), with a sparse neck (M, C) at active head cells."""
+        """Return the neck's output: (B, C, H, W), with a sparse neck (M, C) at active head cells."""
         pillar_features = self.encode(
             batch.features, batch.pillar_index, batch.point_counts, batch.frame_pillars
         )  # (P, C)
@@ -105,7 +105,7 @@ class PillarDetector(Trainable):
             return PillarOutputs(self(pillars), neck)
 
     def loss(self, outputs: PillarOutputs, batch: LabeledPillars) -> Mapping[str, Tensor]:
-        """Return the terms of eq. (15) by name, unitless, from head maps (B, channels, H, W), see `detection_loss`.
+        """Return the terms of eq. (15) by name, from head maps (B, channels, H, W), see `detection_loss`.
 
         Anchors at inactive head cells are left out.
         """

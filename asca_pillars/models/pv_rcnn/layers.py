@@ -55,7 +55,7 @@ class Adjustment(nn.Module):
         nn.init.zeros_(self.out.bias)
 
     def forward(self, features: Tensor, counted: Tensor) -> Tensor:
-        """Adjust unitless features of groups (M, T, C) -> the same shape.
+        """Adjust features of groups (M, T, C) -> the same shape.
 
         Args:
             features: F.
@@ -212,12 +212,12 @@ class DualAttention(nn.Module):
         self.place_query = nn.Conv2d(channels, half, 1)
 
     def forward(self, features: Tensor) -> Tensor:
-        """Apply the attention: unitless (B, C, H, W) -> the same shape."""
+        """Apply the attention: (B, C, H, W) -> the same shape."""
         attended = self.by_location(self.by_channel(features))
         return features + _RESIDUAL_WEIGHT * attended if self.residual else attended
 
     def by_channel(self, features: Tensor) -> Tensor:
-        """Return eq. (1) and (2): a weight in (0, 1) for each channel of unitless (B, C, H, W)."""
+        """Return eq. (1) and (2): a weight in (0, 1) for each channel of (B, C, H, W)."""
         values = self.channel_value(features).flatten(2)  # (B, C / 2, HW)
         shares = torch.softmax(self.channel_query(features).flatten(2), dim=2)  # (B, 1, HW)
         pooled = (values @ shares.transpose(1, 2))[:, :, 0]
@@ -225,7 +225,7 @@ class DualAttention(nn.Module):
         return features * weights[:, :, None, None]
 
     def by_location(self, features: Tensor) -> Tensor:
-        """Return eq. (3) and (4): a weight in (0, 1) for each place of unitless (B, C, H, W)."""
+        """Return eq. (3) and (4): a weight in (0, 1) for each place of (B, C, H, W)."""
         values = self.place_value(features)  # (B, C / 2, H, W)
         shares = torch.softmax(self.place_query(features).mean(dim=(2, 3)), dim=1)  # (B, C / 2)
         return features * torch.sigmoid((values * shares[:, :, None, None]).sum(dim=1, keepdim=True))
@@ -243,7 +243,7 @@ class SparseConvBlock(nn.Module):
         self.norm = nn.BatchNorm1d(channels, eps=NORM_EPS, momentum=NORM_MOMENTUM)
 
     def forward(self, features: Tensor, table: Tensor, back: Tensor | None = None) -> Tensor:
-        """Apply the block: unitless (N, in_channels) -> (M, channels), see `rulebook_conv`."""
+        """Apply the block: (N, in_channels) -> (M, channels), see `rulebook_conv`."""
         return torch.relu(self.norm(rulebook_conv(features, self.convolution.weight, table, back)))
 
 
@@ -273,7 +273,7 @@ class VoxelBackbone(nn.Module):
         self.out_channels = out
 
     def forward(self, features: Tensor, levels: Sequence[VoxelLevel[Tensor]]) -> list[Tensor]:
-        """Encode voxel features (N, in_channels) -> unitless (M, channels) of the active cells of every level."""
+        """Encode voxel features (N, in_channels) -> (M, channels) of the active cells of every level."""
         found = []
         for number, level in enumerate(levels):
             if number:
@@ -339,7 +339,7 @@ class PvRcnn(nn.Module):
         self.scales = scales
 
     def propose(self, batch: VoxelBatch[Tensor]) -> FirstStageOutputs:
-        """Encode voxels (N, 4), metres and reflectance -> unitless features (M, C) of every level, and head maps."""
+        """Encode voxels (N, 4), metres and reflectance -> features (M, C) of every level, and head maps."""
         levels = self.voxels(batch.features, batch.levels)
         canvas = self.scatter(levels[-1], batch.levels[-1].cells, len(batch.frame_keypoints))
         maps: HeadMaps[Tensor] = self.head(self.neck(as_map(canvas)))

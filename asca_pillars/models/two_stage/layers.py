@@ -183,7 +183,7 @@ class ContextGate(nn.Module):
         self.value = nn.Linear(channels, channels, bias=False)
 
     def forward(self, features: Tensor) -> Tensor:
-        """Apply the gate: unitless (K, C) -> (K, C)."""
+        """Apply the gate: (K, C) -> (K, C)."""
         gated: Tensor = torch.sigmoid(self.gate(features)) * self.value(features)
         return gated
 

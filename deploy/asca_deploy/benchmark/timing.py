@@ -58,7 +58,7 @@ class Spread:
 
     @classmethod
     def of(cls, ratios: list[float] | NDArray[np.float64]) -> "Spread":
-        """Return the spread of unitless ratios (rounds,)."""
+        """Return the spread of ratios (rounds,)."""
         return cls(*(float(np.percentile(ratios, q)) for q in (50, 25, 75)))
 
 

@@ -101,7 +101,7 @@ class PillarPipeline:
         return pillarize(points, self.spec.grid, self.spec.limits)
 
     def encode(self, pillars: Pillars) -> NDArray[Any]:
-        """Encode features (M, 9) -> unitless pillar features (P, C), of the canvas's type. Paper section 3.2."""
+        """Encode features (M, 9) -> pillar features (P, C), of the canvas's type. Paper section 3.2."""
         if not len(pillars.cells):
             return np.empty((0, self.bundle.pillar.channels), self.bundle.pillar.canvas.type)
         values = {name: getattr(pillars, name) for name in self._encoder.inputs}  # a graph may not need all three

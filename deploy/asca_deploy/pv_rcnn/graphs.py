@@ -137,7 +137,7 @@ def keypoint_inputs(
     bev: NDArray[np.float32],
     balls_of: Sequence[Sequence[NDArray[np.int32]]],
 ) -> dict[str, NDArray[Any]]:
-    """Return the inputs of keypoints.onnx: unitless features (N, C) of levels, (K, C) of the map, balls."""
+    """Return the inputs of keypoints.onnx: features (N, C) of levels, (K, C) of the map, balls."""
     given: dict[str, NDArray[Any]] = {"points": scan.points, "keypoints": scan.keypoints, "bev": bev}
     for number, scale in enumerate(scan.scales):
         given |= {f"scale_{number}_{part}": array for part, array in scale._asdict().items()}
@@ -151,7 +151,7 @@ def keypoint_inputs(
 def deform_inputs(
     scan: VoxelScan, settings: VoxelSetSettings, levels: Mapping[str, NDArray[np.float32]]
 ) -> dict[str, NDArray[Any]]:
-    """Return the inputs of deform.onnx: unitless features (N, C) of levels by name, and the keypoints' neighbors."""
+    """Return the inputs of deform.onnx: features (N, C) of levels by name, and the keypoints' neighbors."""
     given: dict[str, NDArray[Any]] = {"keypoints": scan.keypoints}
     for number, each in enumerate(settings.sources):
         if each in settings.deformed:

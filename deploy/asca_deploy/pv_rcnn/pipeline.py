@@ -183,7 +183,7 @@ class PvRcnnPipeline:
         return voxelized
 
     def encode(self, scan: VoxelScan | VoxelizedScan) -> dict[str, NDArray[Any]]:
-        """Return unitless features (N, C) of the voxels of every level that is read, by name; at least one voxel.
+        """Return features (N, C) of the voxels of every level that is read, by name; at least one voxel.
 
         Those of OUT are whole steps where the map is.
         """
@@ -209,7 +209,7 @@ class PvRcnnPipeline:
         places: Mapping[str, NDArray[np.float32]],
         balls: Sequence[Sequence[NDArray[np.int32]]],
     ) -> NDArray[np.float32]:
-        """Return weighted unitless features (K, C) of the keypoints.
+        """Return weighted features (K, C) of the keypoints.
 
         Args:
             scan: with the keypoints.

@@ -90,7 +90,7 @@ class VoxelProducts(nn.Module):
         return [layer.name for layer in self.layers if layer.level == level][-1]
 
     def passes(self, features: Tensor, rulebooks: Mapping[str, Tensor]) -> Iterator[tuple[str, Tensor, Tensor]]:
-        """Yield name, input (M, taps * C) and output (M, outputs) of each product in turn, mostly unitless."""
+        """Yield name, input (M, taps * C) and output (M, outputs) of each product in turn."""
         for layer in self.layers:
             padded = torch.cat([features, features.new_zeros(1, features.shape[1])])
             read = padded[rulebooks[layer.table].long()].flatten(1)
@@ -117,7 +117,7 @@ class RoundedVoxels:
 
     @property
     def out_steps(self) -> Tensor:
-        """(C,) unitless, value of a step of the last level."""
+        """(C,) value of a step of the last level."""
         return self.steps[self._exact.last_of(OUT)]
 
     def write(self, path: Path, eight_bit: Sequence[str]) -> None:
@@ -135,7 +135,7 @@ def scale_voxels_to_steps(backbone: VoxelProducts, samples: Sequence[VoxelSample
         samples: of the calibration scans.
 
     Returns:
-        (C,) of each product's outputs, unitless.
+        (C,) of each product's outputs.
     """
     highest = highest_outputs(backbone, samples)
     steps = {name: high.clamp_min(TINY) / STEPS for name, high in highest.items()}
@@ -162,7 +162,7 @@ def export_voxels(
         path: of the file.
         levels: the graph's outputs, real values in float32; of OUT uint8 steps, if there are any.
         eight_bit: products that compute in 8 bits, their weights already rounded; others in float.
-        steps: rows behind the first product are uint8, a step worth this (C,), unitless.
+        steps: rows behind the first product are uint8, a step worth this (C,).
     """
     graph, counted = RowGraph(backbone.product, eight_bit), steps is not None
     rows = graph.add_input("features", TensorProto.FLOAT, "voxels", VOXEL_VALUES)
