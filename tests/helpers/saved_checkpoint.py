@@ -13,10 +13,10 @@ def checkpoint_content(checkpoint: Checkpoint) -> dict[str, Any]:
     """What the file holds."""
     assert isinstance(checkpoint.detector, torch.nn.Module)
     weights = {f"detector.{name}": value for name, value in checkpoint.detector.state_dict().items()}
-    about = {"config": to_dict(checkpoint.config)}
+    expected = checkpoint.expected_input
+    about = {"config": to_dict(checkpoint.config), "expected_input": None if expected is None else to_dict(expected)}
     return {"hyper_parameters": about, "state_dict": weights, "global_step": checkpoint.steps}
 
 
 def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
-    """Without what its scans were like."""
     torch.save(checkpoint_content(checkpoint), path)

@@ -107,6 +107,9 @@ def export_refine_bundle(
     8-bit form: of a bundle the one named like it with `_int8`, of a checkpoint one made on those scans. The second
     stage stays in float32.
 
+    Expected input is the first stage's, if that knows its training scans: it reads the whole scan, and the second stage
+    only what lies around its boxes. So two stages look around in one pass if the first one was trained on revolutions.
+
     Raises:
         ExportError: as `export_bundle`, or the 8-bit form is not that of this first stage.
         AscaError: the first stage is not there any more, or another one, or has no 8-bit form.
@@ -138,6 +141,8 @@ def export_refine_bundle(
             backbone_gmac=proposing.backbone_gmac,
             refine=section,
         )
+        if proposing.expected_input_from == "training":
+            draft = dataclasses.replace(draft, expected_input=proposing.expected_input, expected_input_from="training")
 
         def compare(opened: PillarBundle) -> Parity:
             pipeline = RefinePipeline(folder, opened, threads=default_threads())

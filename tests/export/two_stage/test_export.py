@@ -26,6 +26,7 @@ from asca_pillars.models.build import Checkpoint, build_model, load_checkpoint
 from asca_pillars.models.pillar.network import PillarDetector
 from asca_pillars.models.two_stage.first_stage import with_first_stage
 from asca_pillars.models.two_stage.network import RefineDetector
+from asca_pillars.scans.input_check import ExpectedInput
 from asca_pillars.training.loop import train
 from tests.export.deployed import assert_same_detector, changed_manifest
 from tests.export.sweeps import all_at_once
@@ -77,9 +78,16 @@ def test_train_export_detect(trained: tuple[Path, Path], tmp_path: Path) -> None
 
 
 def test_a_sparse_neck_on_a_pooled_map_proposes(trained: tuple[Path, Path], tmp_path: Path) -> None:
+    """Expected input is that of the scans which the first stage was trained on."""
     spec = replace(SPEC, grid=replace(SPEC.grid, map="pooled"))
-    save_checkpoint(tmp_path / "first.ckpt", tiny_checkpoint("channel", spec, neck="sparse"))
-    export_refine_bundle(on_first_stage(tmp_path / "first.ckpt", trained), tmp_path / "bundle", SCANS)
+    revolutions = ExpectedInput((50_000, 60_000), (0.2, 0.3), (-1.8, -1.7), camera_view=False)
+    first = tiny_checkpoint("channel", spec, neck="sparse")._replace(expected_input=revolutions)
+    save_checkpoint(tmp_path / "first.ckpt", first)
+    views = load_checkpoint(trained[0]).expected_input
+    assert views is not None and views.camera_view
+    checkpoint = on_first_stage(tmp_path / "first.ckpt", trained)._replace(expected_input=views)
+    bundle = export_refine_bundle(checkpoint, tmp_path / "bundle", SCANS)
+    assert (bundle.expected_input, bundle.expected_input_from) == (revolutions, "training")
     runtime = Detector(tmp_path / "bundle", score_threshold=0.0, threads=1)
     assert isinstance(runtime.pipeline, RefinePipeline)
     assert runtime.pipeline.stages[2] == "tables" and len(runtime(SCANS[0])) > 0
