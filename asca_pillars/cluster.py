@@ -91,8 +91,8 @@ class ShardFolder:
         """Return the names of those shards whose results are present and intact; every file is read."""
         # One listing: a file that was looked for and not found may stay unseen on a network mount for a minute.
         with os.scandir(self.path) as entries:
-            there = {entry.name for entry in entries}
-        return {shard.name for shard in shards if self._file(shard).name in there and self._is_whole(shard)}
+            names = {entry.name for entry in entries}
+        return {shard.name for shard in shards if self._file(shard).name in names and self._is_whole(shard)}
 
     def write(self, shard: Shard, lines: Iterable[str]) -> None:
         """Write a shard's results, a line of JSON with its end for each item; they appear when all are written."""

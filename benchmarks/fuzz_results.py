@@ -113,7 +113,7 @@ def _boxes(folder: Path) -> list[Kind]:
     about = json.dumps({**ABOUT, "classes": ["Car", "Truck"], "ranges_m": [[0, 60], [-30, 30]], "tracks": True})
 
     def predictions(path: Path) -> Any:
-        return [frame.found for frame in read_box_predictions(path, split).frames]
+        return [frame.detections for frame in read_box_predictions(path, split).frames]
 
     def track_scores(path: Path) -> Any:
         return [one.clear.labels for one in tracking_report(split, path.parent, "fuzz", {}).scores]

@@ -172,12 +172,12 @@ def tables(family: Family, results: Mapping[str, Sequence[dict[str, Any]]], spee
     """
     parts = []
     for title, names in family.tables.items():
-        there = [name for name in names if results.get(name)]
-        if there:
+        trained = [name for name in names if results.get(name)]
+        if trained:
             parts += [
                 f"### {title}\n",
-                _summary(family, there, results, speeds),
-                _by_difficulty(family, there, results),
+                _summary(family, trained, results, speeds),
+                _by_difficulty(family, trained, results),
             ]
     return "\n".join(parts)
 
@@ -225,8 +225,8 @@ def _by_difficulty(family: Family, names: Sequence[str], results: Mapping[str, S
 
 def _ap(result: dict[str, Any], class_name: str, difficulty: str) -> float:
     """Return the 3D AP R40 in percent; 0 for a class without detections."""
-    found = result["results"][class_name]
-    values = found and found["3d"]
+    class_result = result["results"][class_name]
+    values = class_result and class_result["3d"]
     return float(values["R40"][DIFFICULTIES.index(difficulty)]) if values else 0.0
 
 

@@ -214,12 +214,12 @@ def require_not_input(target: str | Path, inputs: Iterable[str | Path | None]) -
 
 def _has(content: bytes, keys: Iterable[str], values: Mapping[str, Any]) -> bool:
     try:
-        found = json.loads(content)
+        record = json.loads(content)
     except (ValueError, RecursionError):  # not JSON, not UTF-8, or nested too deeply
         return False
-    if not isinstance(found, dict):
+    if not isinstance(record, dict):
         return False
-    return all(key in found for key in keys) and all(found.get(key) == value for key, value in values.items())
+    return all(key in record for key in keys) and all(record.get(key) == value for key, value in values.items())
 
 
 def _entries(folder: Path) -> list[Path]:

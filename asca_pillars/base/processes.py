@@ -82,11 +82,11 @@ def _pool(job: Callable[[Any], Any], workers: int) -> Iterator[_Pool]:
         try:
             with one_thread_per_process():
                 for _ in range(workers):
-                    here, there = context.Pipe()
-                    with there:
-                        process: BaseProcess = context.Process(target=_work, args=(job, there), daemon=True)
+                    parent_end, child_end = context.Pipe()
+                    with child_end:
+                        process: BaseProcess = context.Process(target=_work, args=(job, child_end), daemon=True)
                         process.start()
-                    pool[here] = process
+                    pool[parent_end] = process
         except OSError as error:
             raise WorkerError(f"a worker process cannot be started ({error}); use fewer workers") from None
         yield pool

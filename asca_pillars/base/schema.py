@@ -49,8 +49,8 @@ def _flag_for_number(given: Any, taken: Any, path: str = "") -> tuple[str, bool]
         pairs = [(index, *pair) for index, pair in enumerate(zip(given, taken, strict=False))]
     else:
         return (path, given) if isinstance(given, bool) and not isinstance(taken, bool | str | None) else None
-    found = (_flag_for_number(own, other, f"{path}.{key}".lstrip(".")) for key, own, other in pairs)
-    return next((flag for flag in found if flag is not None), None)
+    flags = (_flag_for_number(value, accepted, f"{path}.{key}".lstrip(".")) for key, value, accepted in pairs)
+    return next((flag for flag in flags if flag is not None), None)
 
 
 def to_dict(settings: Any) -> dict[str, Any]:

@@ -184,14 +184,17 @@ def time_variants(todo: Sequence[Run], family: Family, split: KittiSplit, consol
             parameters[name] = sum(part.numel() for part in checkpoint.detector.parameters())
         with console.status(f"Timing {len(detectors)} detectors in alternation"):
             frames = alternate(detectors, scans, TIMED_ROUNDS)
-    times = {name: np.median(own, axis=1) for name, own in frames.items()}
+    times = {name: np.median(samples, axis=1) for name, samples in frames.items()}
     reference = times[next(name for name in family.variants if name in times)]
     return {
         name: Speed(
-            fps=1e3 / float(np.median(own)),
-            ratio=float(np.median(own / reference)),
-            ratio_quartiles=(float(np.quantile(own / reference, 0.25)), float(np.quantile(own / reference, 0.75))),
+            fps=1e3 / float(np.median(samples)),
+            ratio=float(np.median(samples / reference)),
+            ratio_quartiles=(
+                float(np.quantile(samples / reference, 0.25)),
+                float(np.quantile(samples / reference, 0.75)),
+            ),
             parameters=parameters[name],
         )
-        for name, own in times.items()
+        for name, samples in times.items()
     }

@@ -92,8 +92,8 @@ def measure_parts(
     if parts.compare:
         others = {name: _open_like(detector, folder) for name, folder in list(bundles.items())[1:]}
         compared = compare({next(iter(bundles)): detector} | others, scans, rounds, bar)
-        found, *theirs = ([one(points) for points in scans] for one in (detector, *others.values()))
-        boxes = {name: box_difference(found, other) for name, other in zip(others, theirs, strict=True)}
+        detections, *other_detections = ([one(points) for points in scans] for one in (detector, *others.values()))
+        boxes = {name: box_difference(detections, other) for name, other in zip(others, other_detections, strict=True)}
         result["compare"] = asdict(compared) | {"boxes": {name: asdict(one) for name, one in boxes.items()}}
         console.print(comparison_table(compared, boxes))
     if parts.matrix:
@@ -172,21 +172,21 @@ def machine_line(report: BenchmarkReport) -> str:
     return f"{report.cpu}, {report.threads} threads, {report.runs_on}; {versions}"
 
 
-def roofline_line(found: Roofline, *, sparse: bool) -> str:
+def roofline_line(roofline: Roofline, *, sparse: bool) -> str:
     """Return achieved and possible rates; for a sparse neck both are means over the scans of its export."""
-    rates = ", ".join(f"{kind} {rate:.0f}" for kind, rate in found.gemm_gmac_s.items())
+    rates = ", ".join(f"{kind} {rate:.0f}" for kind, rate in roofline.gemm_gmac_s.items())
     return (
-        f"roofline: backbone {found.gmac:.1f} GMAC at {found.achieved_gmac_s:.0f} GMAC/s, {found.share:.0%} of this "
-        f"machine's {found.type} matrix product (GMAC/s measured in onnxruntime, {found.threads} threads: {rates})"
-        + ("; GMAC of the mean scan of the export, these may have more or fewer" if sparse else "")
+        f"roofline: backbone {roofline.gmac:.1f} GMAC at {roofline.achieved_gmac_s:.0f} GMAC/s, {roofline.share:.0%} "
+        f"of this machine's {roofline.type} matrix product (GMAC/s measured in onnxruntime, {roofline.threads} "
+        f"threads: {rates})" + ("; GMAC of the mean scan of the export, these may have more or fewer" if sparse else "")
     )
 
 
-def comparison_table(found: Comparison, boxes: Mapping[str, BoxDifference] | None = None) -> Table:
+def comparison_table(comparison: Comparison, boxes: Mapping[str, BoxDifference] | None = None) -> Table:
     """Return a table of bundles with their speed relative to the first and, if known, the difference of their boxes."""
-    title = "; ".join([f"{found.rounds} rounds in turn", *([_BOXES] if boxes else [])])
+    title = "; ".join([f"{comparison.rounds} rounds in turn", *([_BOXES] if boxes else [])])
     table = _table(title, "", "p50 ms", "p95 ms", "FPS", "times as fast", *(["boxes"] if boxes else []))
-    for one in found.contestants:
+    for one in comparison.contestants:
         table.add_row(
             one.name, *_speed(one), *([_difference_text(boxes[one.name])] if boxes and one.name in boxes else [])
         )
@@ -221,24 +221,24 @@ def scaling_table(rows: Sequence[ScalingRow]) -> Table:
     return table
 
 
-def stream_table(found: Throughput) -> Table:
+def stream_table(throughput: Throughput) -> Table:
     """Return a table of single calls and streaming."""
-    title = f"Stream: {_spread(found.gain)} times the scans per second, {found.rounds} rounds in turn"
+    title = f"Stream: {_spread(throughput.gain)} times the scans per second, {throughput.rounds} rounds in turn"
     table = _table(title, "", "scans per second", "latency p50 ms", "p95 ms")
     for name, fps, latency in (
-        ("one by one", found.single_fps, found.single_latency_ms),
-        ("stream", found.stream_fps, found.stream_latency_ms),
+        ("one by one", throughput.single_fps, throughput.single_latency_ms),
+        ("stream", throughput.stream_fps, throughput.stream_latency_ms),
     ):
         table.add_row(name, f"{fps:.1f}", f"{latency.p50:.1f}", f"{latency.p95:.1f}")
     return table
 
 
-def cold_line(found: ColdStart) -> str:
+def cold_line(cold: ColdStart) -> str:
     """Return the times and the memory of a new process."""
-    memory = found.detect_peak_memory_mib
+    memory = cold.detect_peak_memory_mib
     return (
-        f"new process: {found.first_boxes_s:.2f} s to the first boxes (import {found.import_s:.2f}, load "
-        f"{found.load_s:.2f}, first scan {found.first_scan_s:.2f}; median of {found.repeats})"
+        f"new process: {cold.first_boxes_s:.2f} s to the first boxes (import {cold.import_s:.2f}, load "
+        f"{cold.load_s:.2f}, first scan {cold.first_scan_s:.2f}; median of {cold.repeats})"
         + ("" if memory is None else f"; `asca detect` peaks at {memory:.0f} MiB")
     )
 

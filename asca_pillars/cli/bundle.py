@@ -67,7 +67,7 @@ def verify(bundle: _BundleArgument = None) -> None:
 
     folder = find_bundle(bundle)
     detector = Detector(folder)  # compares hashes, metadata and shapes
-    found = detector(read_scan(sample_scan_path()).points)
+    detections = detector(read_scan(sample_scan_path()).points)
     made_by = detector.made_by
-    print(f"{folder}: whole; {len(found)} boxes in the sample scan, {found.report.total_ms:.0f} ms")
+    print(f"{folder}: whole; {len(detections)} boxes in the sample scan, {detections.report.total_ms:.0f} ms")
     print(f"{made_by['model']}, weights {made_by['weights_sha256'][:12]}, asca-pillars {made_by['version']}")

@@ -277,7 +277,7 @@ def detect(
     from asca_deploy.detect_scans import detect_scans
 
     with Bars(console) as bars:
-        found = detect_scans(
+        result = detect_scans(
             scans or None,
             out,
             options=options,
@@ -296,7 +296,7 @@ def detect(
             failed=lambda line: print(f"asca: {line}", file=sys.stderr),
         )
     _write_labels(out, write, console)
-    _print_scans(found, [path for path in (foxglove, rerun, video) if path is not None], out, console)
+    _print_scans(result, [path for path in (foxglove, rerun, video) if path is not None], out, console)
 
 
 def _refuse_times(rate: float | None, times: Path | None) -> None:
@@ -315,50 +315,50 @@ def _write_labels(out: Path, name: str | None, console: "Console") -> None:
         console.print(f"Labels to correct: {write_prelabels(out / RUN_FILE, name, out)}/", soft_wrap=True)
 
 
-def _print_scans(found: "DetectedScans", files: Sequence[Path], out: Path, console: "Console") -> None:
+def _print_scans(result: "DetectedScans", files: Sequence[Path], out: Path, console: "Console") -> None:
     """Print boxes or a line per scan, remarks and times; PartialError if some scans failed."""
     from asca_deploy.auto import summary
     from asca_pillars.cli import detect_tables as show
 
-    detector = found.detector
+    detector = result.detector
     if detector.candidates:
         console.print(summary(detector.runs_on, detector.candidates), soft_wrap=True)
-    asked = len(found) + found.unreadable
+    asked = len(result) + result.unreadable
     one = asked == 1
-    console.print(show.boxes(found[0].path, found[0].detections) if one else show.scans(found, detector.spec))
-    for line in found.remarks:
+    console.print(show.boxes(result[0].path, result[0].detections) if one else show.scans(result, detector.spec))
+    for line in result.remarks:
         show.remark(console, line)
-    reports = [scan.detections.report for scan in found]
+    reports = [scan.detections.report for scan in result]
     while len(reports) < TIMED_FRAMES:
-        reports.append(detector(found.last_points).report)
+        reports.append(detector(result.last_points).report)
     console.print(show.timing(reports[1:], detector))
     console.print(f"Results: {', '.join([f'{out}/', *map(str, files)])}", soft_wrap=True)
-    if unwritten := len(found.failed) - found.unreadable:
+    if unwritten := len(result.failed) - result.unreadable:
         raise PartialError(f"results of {unwritten} of {asked} scans could not be written; they are named above")
-    if found.unreadable:
-        raise PartialError(f"{found.unreadable} of {asked} scans could not be read; they are named above")
+    if result.unreadable:
+        raise PartialError(f"{result.unreadable} of {asked} scans could not be read; they are named above")
 
 
-def _print_recording(found: "RecordingResult", console: "Console") -> None:
+def _print_recording(result: "RecordingResult", console: "Console") -> None:
     """Print counts and files; PartialError if parts of the recording could not be read."""
-    boxes = ", ".join(f"{count} {name}" for name, count in found.boxes.items())
-    console.print(f"{found.scans} scans, in all {boxes}", highlight=False)
-    if found.cpu_ms_per_scan is not None:
-        console.print(f"{found.cpu_ms_per_scan:.1f} ms of CPU per scan")
-    console.print(f"Results: {', '.join(map(str, found.files))}", soft_wrap=True)
-    if found.problems:
-        raise PartialError("; ".join(found.problems))
+    boxes = ", ".join(f"{count} {name}" for name, count in result.boxes.items())
+    console.print(f"{result.scans} scans, in all {boxes}", highlight=False)
+    if result.cpu_ms_per_scan is not None:
+        console.print(f"{result.cpu_ms_per_scan:.1f} ms of CPU per scan")
+    console.print(f"Results: {', '.join(map(str, result.files))}", soft_wrap=True)
+    if result.problems:
+        raise PartialError("; ".join(result.problems))
 
 
-def _print_archive(found: "ArchiveResult", out: Path, console: "Console") -> None:
+def _print_archive(result: "ArchiveResult", out: Path, console: "Console") -> None:
     """Print counts; PartialError if some scans could not be read."""
     from asca_deploy.result_files import RUN_FILE, UNREADABLE_FILE
 
-    detected, unreadable = found.counts
-    if found.done_before:
-        console.print(f"{found.done_before} scans were done by an earlier run", highlight=False)
-    if found.repeats:
-        console.print(f"{found.repeats} shards were begun again after their worker had died", highlight=False)
+    detected, unreadable = result.counts
+    if result.done_before:
+        console.print(f"{result.done_before} scans were done by an earlier run", highlight=False)
+    if result.repeats:
+        console.print(f"{result.repeats} shards were begun again after their worker had died", highlight=False)
     console.print(f"{detected} scans: {out / RUN_FILE}", highlight=False, soft_wrap=True)
     if unreadable:
         named = out / UNREADABLE_FILE

@@ -155,18 +155,20 @@ def _inspect_scans(data: Path, json: Path | None, **options: Any) -> None:
     require_writable(json, *report_json, inputs=(data,))
     console = Console(markup=False, highlight=False)
     with Bars(console, transient=True) as bars:
-        found = inspect_scans(data, **options, progress=bars)
+        inspection = inspect_scans(data, **options, progress=bars)
     if json is not None:
         require_own_file(json, *report_json)
-        height = None if found.height is None else found.height._asdict()
-        write_json(json, asdict(found) | {"topics": [topic._asdict() for topic in found.topics], "height": height})
-    for part in (*show.recorded(found), show.unlabelled(found)):
+        height = None if inspection.height is None else inspection.height._asdict()
+        write_json(
+            json, asdict(inspection) | {"topics": [topic._asdict() for topic in inspection.topics], "height": height}
+        )
+    for part in (*show.recorded(inspection), show.unlabelled(inspection)):
         console.print(part, soft_wrap=isinstance(part, str))
-    for text in found.findings:
+    for text in inspection.findings:
         console.print(f"warning: {printable(text)}", style="yellow", soft_wrap=True)
-    if found.problems:
-        raise PartialError("; ".join(found.problems))
-    if not found.findings:
+    if inspection.problems:
+        raise PartialError("; ".join(inspection.problems))
+    if not inspection.findings:
         console.print("Nothing to warn of.")
 
 
@@ -229,10 +231,10 @@ def _inspect_dataset(
         inspection = inspect_dataset(
             frames_of, spec, settings.data, assigner=assigner, frames=frames, reporter=Reporter(bars)
         )
-    found = findings(inspection, spec, min_points)
+    problems = findings(inspection, spec, min_points)
     if json is not None:
         report = {"config": settings.name} | dataclasses.asdict(inspection)
-        report |= {"findings": [finding._asdict() for finding in found]}
+        report |= {"findings": [finding._asdict() for finding in problems]}
         require_own_file(json, *report_json)
         write_json(json, report)
     console.print(
@@ -247,13 +249,13 @@ def _inspect_dataset(
     console.print(show.matching(inspection), show.scans(inspection, input_cells(spec), view), sep="\n")
     if draw is not None:
         console.print("\n".join(draw_frames(data, frames_of.name, settings, draw, pictures)), soft_wrap=True)
-    errors = [finding for finding in found if finding.level == "error"]
-    for finding in found:
+    errors = [finding for finding in problems if finding.level == "error"]
+    for finding in problems:
         if finding not in errors[:1]:  # the first one is the command's error, below all of them
             style = "red" if finding.level == "error" else "yellow"
             console.print(f"{finding.level}: {finding.text}", style=style, soft_wrap=True)
     if errors:
         others = f" ({len(errors) - 1} more above)" if errors[1:] else ""
         raise DatasetError(f"{data}: {errors[0].text}{others}")
-    if not found:
+    if not problems:
         console.print("Nothing to warn of.")

@@ -100,49 +100,51 @@ def scans(inspection: Inspection, kind: InputCells, camera_view: bool) -> Table:
     return table
 
 
-def recorded(found: ScansInspection) -> list[Table | str]:
+def recorded(inspection: ScansInspection) -> list[Table | str]:
     """Return what was inspected; for a recording its topics, if there are several, and its times, frames and fields."""
-    of_topic = "" if found.topic is None else f", {printable(found.topic)}"
+    of_topic = "" if inspection.topic is None else f", {printable(inspection.topic)}"
     ranges_text = ", ".join(
-        f"{axis} {low:g} to {high:g}" for axis, (low, high) in zip("xyz", found.ranges, strict=True)
+        f"{axis} {low:g} to {high:g}" for axis, (low, high) in zip("xyz", inspection.ranges, strict=True)
     )
     lines: list[Table | str] = [
-        f"{found.path}{of_topic}: {found.inspected} of {found.scans} scans measured",
-        f"against {found.model}, which looks in {ranges_text} m",
-        *map(printable, found.notes),
+        f"{inspection.path}{of_topic}: {inspection.inspected} of {inspection.scans} scans measured",
+        f"against {inspection.model}, which looks in {ranges_text} m",
+        *map(printable, inspection.notes),
     ]
-    if len(found.topics) > 1:
+    if len(inspection.topics) > 1:
         topics = _table("Topics", "topic", "type", "messages")
-        for topic in found.topics:
+        for topic in inspection.topics:
             topics.add_row(printable(topic.name), printable(topic.type), str(topic.messages))
         lines.append(topics)
     facts = []
-    if found.times is not None:
-        rate = "" if found.times.rate_hz is None else f", {found.times.rate_hz:.3g} scans per second"
-        facts.append(f"{found.times.seconds:.1f} s{rate}")
-    if found.frame_ids:
-        facts.append(f"frame {', '.join(found.frame_ids)}")
-    if found.fields:
-        facts.append(f"fields {', '.join(found.fields)}")
+    if inspection.times is not None:
+        rate = "" if inspection.times.rate_hz is None else f", {inspection.times.rate_hz:.3g} scans per second"
+        facts.append(f"{inspection.times.seconds:.1f} s{rate}")
+    if inspection.frame_ids:
+        facts.append(f"frame {', '.join(inspection.frame_ids)}")
+    if inspection.fields:
+        facts.append(f"fields {', '.join(inspection.fields)}")
     return [*lines, *([printable("; ".join(facts))] if facts else [])]
 
 
-def unlabelled(found: ScansInspection) -> Table:
+def unlabelled(inspection: ScansInspection) -> Table:
     """Return a table of points, reflectance, ground and ranges of unlabelled scans, beside the training scans'."""
-    expected, height = found.expected, found.height
+    expected, height = inspection.expected, inspection.height
     low, high = expected.points_per_scan
     view = " (a camera's view)" if expected.camera_view else ""
     dark, bright = expected.reflectance_mean
     ground = "-" if expected.ground_z_m is None else f"{expected.ground_z_m[0]:.2f} to {expected.ground_z_m[1]:.2f}"
     trained_m = "-" if expected.sensor_height_m is None else f"{expected.sensor_height_m:.2f}"
-    share = None if found.inside_share is None else Spread(*(100 * value for value in found.inside_share))
+    share = None if inspection.inside_share is None else Spread(*(100 * value for value in inspection.inside_share))
     table = _table("Scans: 10 % / median / 90 %", "", "found", "expected")
-    table.add_row("points", _spread(found.points), f"{low} to {high}{view}")
-    table.add_row("points not finite", str(found.not_finite), "0")
+    table.add_row("points", _spread(inspection.points), f"{low} to {high}{view}")
+    table.add_row("points not finite", str(inspection.not_finite), "0")
     table.add_row("points within the ranges, %", _spread(share, 1), "")
-    table.add_row("reflectance as stored", ", ".join(f"0 to {one:g}" for one in found.reflectance_scales) or "none", "")
-    table.add_row("mean reflectance as read", _spread(found.reflectance, 3), f"{dark:.3f} to {bright:.3f}")
-    table.add_row("ground near the sensor, z, m", _spread(found.ground_z_m, 2), ground)
+    table.add_row(
+        "reflectance as stored", ", ".join(f"0 to {one:g}" for one in inspection.reflectance_scales) or "none", ""
+    )
+    table.add_row("mean reflectance as read", _spread(inspection.reflectance, 3), f"{dark:.3f} to {bright:.3f}")
+    table.add_row("ground near the sensor, z, m", _spread(inspection.ground_z_m, 2), ground)
     table.add_row("sensor above the ground, m", "-" if height is None else f"{height.height_m:.2f}", trained_m)
     return table
 

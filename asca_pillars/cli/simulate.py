@@ -161,8 +161,8 @@ def simulate(
 
         open_model(RuntimeOptions(bundle=bundle), 0.0)  # likewise a wrong bundle
     console = Console(markup=False)
-    there = any((out / "training" / "velodyne").glob("*.bin"))
-    if sequences is not None or frames is not None or not (there and (report or like is not None)):
+    has_scans = any((out / "training" / "velodyne").glob("*.bin"))
+    if sequences is not None or frames is not None or not (has_scans and (report or like is not None)):
         with Bars(console) as bars:
             done = run(
                 out,

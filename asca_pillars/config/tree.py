@@ -201,10 +201,10 @@ class Config(Strict):
     train: TrainConfig = field(default_factory=TrainConfig)
 
     def __post_init__(self) -> None:
-        wanted, names = self.augment.insert.proportions, self.model.spec.class_names
-        if unknown := [name for name in wanted if name not in names]:
+        proportions, names = self.augment.insert.proportions, self.model.spec.class_names
+        if unknown := [name for name in proportions if name not in names]:
             raise ConfigError(f"augment.insert.proportions.{unknown[0]}: no such class; there are {', '.join(names)}")
-        if wanted and not any(wanted.values()):
+        if proportions and not any(proportions.values()):
             raise ConfigError("augment.insert.proportions: all are 0; set augment.insert.method=none to insert nothing")
         if isinstance(self.model, RefineModel):
             self._require_still_objects()

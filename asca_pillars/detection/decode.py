@@ -151,8 +151,8 @@ def decode_candidates(
     residuals = rows.boxes.reshape(-1, count, 7)[row, anchor]
     directions = rows.directions.reshape(-1, count, 2)[row, anchor]
     with np.errstate(over="ignore", invalid="ignore"):  # overflows are left out below
-        own = anchors.reshape(-1, count, 7)[cell, anchor]
-        boxes = decode_boxes(residuals, directions.argmax(axis=-1), own, direction_offset_rad)
+        chosen_anchors = anchors.reshape(-1, count, 7)[cell, anchor]
+        boxes = decode_boxes(residuals, directions.argmax(axis=-1), chosen_anchors, direction_offset_rad)
     usable = np.isfinite(boxes).all(axis=1) & np.isfinite(directions).all(axis=1) & np.isfinite(logits)
     dropped = np.count_nonzero(~usable & np.isfinite(logits))
     return Candidates(
@@ -197,8 +197,8 @@ def nms_by_class(
     """Apply `rotated_nms` within each class: (N, 7), (N,), (N,) -> indices of the kept boxes, class after class."""
     kept = [np.empty(0, np.int64)]
     for label in np.unique(labels):
-        own = np.flatnonzero(labels == label)
-        kept.append(own[rotated_nms(boxes[own], scores[own], iou_threshold, limit)])
+        of_class = np.flatnonzero(labels == label)
+        kept.append(of_class[rotated_nms(boxes[of_class], scores[of_class], iou_threshold, limit)])
     return np.concatenate(kept)
 
 
@@ -267,10 +267,10 @@ def _candidates(
     row, anchor = np.divmod(above, count)
     own_class, chosen = _labels(anchor, row, labels), []
     for label, floor in enumerate(floors):
-        own = np.flatnonzero((own_class == label) & (logits >= floor))
-        if len(own) > limit:
-            own = own[logits[own] >= np.partition(logits[own], -limit)[-limit]]
-        chosen.append(own[np.lexsort((row[own], anchor[own], -logits[own]))[:limit]])
+        of_class = np.flatnonzero((own_class == label) & (logits >= floor))
+        if len(of_class) > limit:
+            of_class = of_class[logits[of_class] >= np.partition(logits[of_class], -limit)[-limit]]
+        chosen.append(of_class[np.lexsort((row[of_class], anchor[of_class], -logits[of_class]))[:limit]])
     best = np.concatenate(chosen)
     return anchor[best], row[best]
 

@@ -106,9 +106,9 @@ class Detections:
     def to_dicts(self) -> list[dict[str, str | float]]:
         """Return `class`, `score` and the fields of `Detection` from `x_m` on of each detection, with four decimals."""
         return [
-            {"class": found.class_name}
-            | {key: round(value, _DIGITS) for key, value in found._asdict().items() if key != "class_name"}
-            for found in self
+            {"class": detection.class_name}
+            | {key: round(value, _DIGITS) for key, value in detection._asdict().items() if key != "class_name"}
+            for detection in self
         ]
 
     def to_json(self) -> str:

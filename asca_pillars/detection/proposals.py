@@ -70,8 +70,8 @@ def best_of_each_class(detections: Detections, quotas: Sequence[int]) -> Detecti
         raise ValueError(f"{len(quotas)} quotas for the {len(detections.class_names)} classes {detections.class_names}")
     kept: list[NDArray[np.int64]] = []
     for label, quota in enumerate(quotas):
-        own = np.flatnonzero(detections.labels == label)
-        kept.append(own[np.argsort(-detections.scores[own], kind="stable")[:quota]])
+        of_class = np.flatnonzero(detections.labels == label)
+        kept.append(of_class[np.argsort(-detections.scores[of_class], kind="stable")[:quota]])
     return detections[np.sort(np.concatenate(kept))]
 
 

@@ -77,9 +77,9 @@ def assign_targets(
     else:
         state, positives, matched = _match_nearest(anchors, boxes, labels, box_rows)
     state[_ignored(anchors, classes, boxes[labels == IGNORED]) & (state == 0)] = -1
-    found = anchors.reshape(-1, 7)[positives]
-    residuals, directions = encode_boxes(boxes[matched], found, direction_offset_rad)
-    return Targets(state, positives, found, residuals, directions, matched)
+    positive_anchors = anchors.reshape(-1, 7)[positives]
+    residuals, directions = encode_boxes(boxes[matched], positive_anchors, direction_offset_rad)
+    return Targets(state, positives, positive_anchors, residuals, directions, matched)
 
 
 class _Matches(NamedTuple):
@@ -232,12 +232,12 @@ def greedy_matches(detections: _Indices, objects: _Indices) -> NDArray[np.bool_]
         (P,) which pairs are matched.
     """
     matched = np.zeros(len(detections), dtype=bool)
-    taken: set[int] = set()
-    found: set[int] = set()
+    matched_detections: set[int] = set()
+    matched_objects: set[int] = set()
     for row, (detection, item) in enumerate(zip(detections.tolist(), objects.tolist(), strict=True)):
-        if detection not in taken and item not in found:
-            taken.add(detection)
-            found.add(item)
+        if detection not in matched_detections and item not in matched_objects:
+            matched_detections.add(detection)
+            matched_objects.add(item)
             matched[row] = True
     return matched
 

@@ -59,7 +59,7 @@ def evaluate_boxes(
         who = predictions_name(predictions)
         analysis = prepare_errors(who, split, task.errors_by, task.beside) if task.errors else None
         frames = read_box_predictions(predictions, split, reporter=reporter)
-        class_names = tuple(sorted({kind for frame in frames.frames for kind in frame.found_types}))
+        class_names = tuple(sorted({kind for frame in frames.frames for kind in frame.detection_types}))
         scores = scores_by_class(task.score, dict.fromkeys(class_names, TEXT_SCORE))
         subject, about = f"{predictions} against {data}", about | {"predictions": str(predictions)}
     _require_common_class(frames, class_names, data)
@@ -67,7 +67,7 @@ def evaluate_boxes(
     warn_of_degrees(
         reporter,
         labels=[split.label_yaws(frame.frame_id) for frame in frames.frames],
-        predictions=[level.boxes(frame.found)[:, 6] for frame in frames.frames],
+        predictions=[level.boxes(frame.detections)[:, 6] for frame in frames.frames],
     )
     about["environment"] = describe_environment()
     at_score = fixed_scores(frames.frames, class_names, scores)
@@ -78,9 +78,9 @@ def evaluate_boxes(
     errors = None
     if analysis is not None:
         labelled = {kind for frame in frames.frames for kind in frame.object_types}
-        found = {name: score for name, score in scores.items() if name in labelled}
+        labelled_scores = {name: score for name, score in scores.items() if name in labelled}
         read = BoxErrorFrames(split, frames.frames)
-        errors = report_errors(analysis, read, found, subject, about, task.out, reporter)
+        errors = report_errors(analysis, read, labelled_scores, subject, about, task.out, reporter)
     return Evaluation(protocol, content, page, errors, task.out)
 
 

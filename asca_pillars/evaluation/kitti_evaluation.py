@@ -228,8 +228,8 @@ def warn_of_unusual_scans(model: Model, scans: int, reporter: Reporter) -> None:
 
 def warn_of_degrees(reporter: Reporter, **yaws: Sequence[NDArray[np.floating]]) -> None:
     """Say of which files, labels or predictions, the yaws look like degrees."""
-    for what, own in yaws.items():
-        if (doubt := check_yaws(own)) is not None:
+    for what, values in yaws.items():
+        if (doubt := check_yaws(values)) is not None:
             reporter.remark(f"{what}: {doubt}")
 
 
@@ -277,12 +277,14 @@ def report_kitti(
     task: Task, frames: ScoredFrames, out: Path, json_path: Path | None, reporter: Reporter
 ) -> tuple[dict[str, Any], ReportPage]:
     """Evaluate; write the tables, the JSON (to `json_path` too) and the curves."""
-    truth, found = frames.truth, frames.detections
+    truth, detections = frames.truth, frames.detections
     bands_m = tuple(BANDS_M)
-    ap = evaluate(truth, found, CLASS_NAMES, bands_m=bands_m, reporter=reporter)
-    points = operating_points(truth, found, CLASS_NAMES, scores=task.scores, difficulties=DIFFICULTIES, bands_m=bands_m)
+    ap = evaluate(truth, detections, CLASS_NAMES, bands_m=bands_m, reporter=reporter)
+    points = operating_points(
+        truth, detections, CLASS_NAMES, scores=task.scores, difficulties=DIFFICULTIES, bands_m=bands_m
+    )
     about = task.about | {"environment": describe_environment()}
-    report = KittiReport(task.subject, frames, ap, points, best_scores(truth, found, CLASS_NAMES), about)
+    report = KittiReport(task.subject, frames, ap, points, best_scores(truth, detections, CLASS_NAMES), about)
     page = ReportPage(report.title, kitti_tables(report), kitti_notes(report))
     content = kitti_json(report)
     write_report("report", page, content, out, json_path, task.predictions)
@@ -301,8 +303,8 @@ def analyze_errors(
 ) -> ReportPage:
     """Write the error analysis of KITTI's classes that are labelled or detected below `out`."""
     assert task.split is not None, "checked with the arguments"
-    there = {name for frame in (*frames.truth, *frames.detections) for name in frame.folded_types.tolist()}
-    scores = {name: score for name, score in task.scores.items() if name.casefold() in there}
+    types = {name for frame in (*frames.truth, *frames.detections) for name in frame.folded_types.tolist()}
+    scores = {name: score for name, score in task.scores.items() if name.casefold() in types}
     frame_ids = tuple(frame.frame_id for frame in frames.truth)
     read = KittiErrorFrames(task.split, task.labels, task.predictions, tuple(scores), frame_ids)
     about = task.about | {"environment": describe_environment()}
@@ -328,19 +330,21 @@ def draw_gallery(
     count = GALLERY_FRAMES if count is None else count
     if task.split is None or count == 0:
         return
-    own = report_files.EvaluatedDetector(task.subject, task.predictions, _match_at_scores(frames, task.scores))
+    evaluated = report_files.EvaluatedDetector(task.subject, task.predictions, _match_at_scores(frames, task.scores))
     detectors = (
-        [own] if compare is None else _with_distinct_names(own, task, _read_compared(compare, task, frames, reporter))
+        [evaluated]
+        if compare is None
+        else _with_distinct_names(evaluated, task, _read_compared(compare, task, frames, reporter))
     )
     with atomic_directory(out / "gallery", *GALLERY_FOLDER) as folder:
         report_files.write_gallery(folder, detectors, count, task.split, task.labels, task.ranges, reporter=reporter)
 
 
 def _with_distinct_names(
-    own: report_files.EvaluatedDetector, task: Task, other: report_files.EvaluatedDetector
+    evaluated: report_files.EvaluatedDetector, task: Task, other: report_files.EvaluatedDetector
 ) -> list[report_files.EvaluatedDetector]:
     """Return both detectors named by their models, or by their folders if these are the same."""
-    named = [replace(own, name=_name(task.about, task.predictions)), other]
+    named = [replace(evaluated, name=_name(task.about, task.predictions)), other]
     if named[0].name == named[1].name:
         named = [replace(one, name=f"{one.name}, {one.predictions}") for one in named]
     return named
@@ -351,11 +355,11 @@ def _read_compared(
 ) -> report_files.EvaluatedDetector:
     """Return the detector of a folder of predictions, at its own scores if an evaluation of it states them."""
     about = _made_by(compare)
-    found = read_predictions(compare, frames.truth, task.labels, reporter=reporter)
-    if found.shortage is not None:
-        reporter.remark(f"--compare {compare}: {found.shortage}")
+    predictions = read_predictions(compare, frames.truth, task.labels, reporter=reporter)
+    if predictions.shortage is not None:
+        reporter.remark(f"--compare {compare}: {predictions.shortage}")
     return report_files.EvaluatedDetector(
-        _name(about, compare), compare, _match_at_scores(found, task.scores | _stated_scores(about))
+        _name(about, compare), compare, _match_at_scores(predictions, task.scores | _stated_scores(about))
     )
 
 

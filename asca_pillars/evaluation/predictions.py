@@ -107,14 +107,14 @@ def read_predictions(
         DatasetError: as `read_truth`; a line without a score; a prediction without labels.
     """
     folder, labels = Path(folder), Path(labels)
-    there = dict.fromkeys(_frame_ids(folder, "predictions"))
+    predicted_ids = dict.fromkeys(_frame_ids(folder, "predictions"))
     known = {frame.frame_id for frame in truth}
-    unlabeled = [name for name in there if name not in known and not (labels / f"{name}.txt").is_file()]
-    pairs = [frame for frame in truth if frame.frame_id in there]
+    unlabeled = [name for name in predicted_ids if name not in known and not (labels / f"{name}.txt").is_file()]
+    pairs = [frame for frame in truth if frame.frame_id in predicted_ids]
     if not pairs:
         raise DatasetError(
-            f"{folder}: none of its {len(there)} files is of a frame to be evaluated, as {truth[0].frame_id}.txt would "
-            f"be; give files the names of those in {labels}"
+            f"{folder}: none of its {len(predicted_ids)} files is of a frame to be evaluated, as "
+            f"{truth[0].frame_id}.txt would be; give files the names of those in {labels}"
         )
     if unlabeled:
         raise DatasetError(
@@ -124,7 +124,7 @@ def read_predictions(
     detections = tuple(
         _read_frame(folder, frame.frame_id, scored=True) for frame in reporter.track(pairs, "Reading predictions")
     )
-    missing = tuple(frame.frame_id for frame in truth if frame.frame_id not in there)
+    missing = tuple(frame.frame_id for frame in truth if frame.frame_id not in predicted_ids)
     return ScoredFrames(tuple(pairs), detections, missing)
 
 
@@ -155,8 +155,8 @@ def write_predictions(
         points = read_scan(split.scan_path(frame_id)).points
         if camera_view:
             points = points[in_image(points, calibration, image_size_wh)]
-        found = detect(points)
-        objects = objects_from_boxes(found.boxes, found.names, calibration, image_size_wh, found.scores)
+        detections = detect(points)
+        objects = objects_from_boxes(detections.boxes, detections.names, calibration, image_size_wh, detections.scores)
         write_labels(Path(folder) / f"{frame_id}.txt", [item for item in objects if item.bbox[2] > item.bbox[0]])
 
 

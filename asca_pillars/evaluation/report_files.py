@@ -99,16 +99,16 @@ def most_different_frames(first: Matches, second: Matches, count: int) -> list[t
 
     Frames that one of them lacks, and those without differences, are left out.
     """
-    there = {frame.frame_id: frame for frame in second}
-    pairs = [(frame, there[frame.frame_id]) for frame in first if frame.frame_id in there]
+    by_id = {frame.frame_id: frame for frame in second}
+    pairs = [(frame, by_id[frame.frame_id]) for frame in first if frame.frame_id in by_id]
     different = [pair for pair in pairs if _difference(*pair)]
     return sorted(different, key=lambda pair: (-_difference(*pair), pair[0].frame_id))[:count]
 
 
 def _difference(first: ScoreMatches, second: ScoreMatches) -> int:
     """Return the number of objects found by only one of the two, plus the difference of their false positives."""
-    found = np.logical_xor(first.found, second.found).sum()
-    return int(found) + abs(int(first.false_positive.sum()) - int(second.false_positive.sum()))
+    found_once = np.logical_xor(first.found, second.found).sum()
+    return int(found_once) + abs(int(first.false_positive.sum()) - int(second.false_positive.sum()))
 
 
 def write_gallery(
@@ -174,8 +174,8 @@ def _draw(
     points = points[in_image(points, calibration, split.image_size_wh(frame_id))]
     image = read_image(split.image_path(frame_id))
     truth = read_labels(labels / f"{frame_id}.txt")
-    found = [read_labels(detector.predictions / f"{frame_id}.txt") for detector in detectors]
-    layers = [_layers(one, truth, own, calibration) for one, own in zip(matches, found, strict=True)]
+    detections = [read_labels(detector.predictions / f"{frame_id}.txt") for detector in detectors]
+    layers = [_layers(one, truth, own, calibration) for one, own in zip(matches, detections, strict=True)]
     every_box = np.concatenate([layer.boxes for own in layers for layer in own])
     panels = []
     for detector, own in zip(detectors, layers, strict=True):
@@ -187,15 +187,15 @@ def _draw(
 
 
 def _layers(
-    frame: ScoreMatches, truth: Sequence[KittiObject], found: Sequence[KittiObject], calibration: Calibration
+    frame: ScoreMatches, truth: Sequence[KittiObject], detections: Sequence[KittiObject], calibration: Calibration
 ) -> list[BoxLayer]:
     return [
         _layer(_MISSED, truth, frame.missed, calibration),
-        _layer(_FALSE, found, frame.false_positive, calibration),
+        _layer(_FALSE, detections, frame.false_positive, calibration),
         _layer(_FOUND, truth, frame.found, calibration),
-        _layer(_TRUE, found, frame.true_positive, calibration),
+        _layer(_TRUE, detections, frame.true_positive, calibration),
         _layer(_NOT_COUNTED, truth, frame.not_counted, calibration),
-        _layer(_IGNORED, found, frame.ignored, calibration),
+        _layer(_IGNORED, detections, frame.ignored, calibration),
     ]
 
 
@@ -214,9 +214,9 @@ def _headed(picture: Image, text: str) -> Image:
 def _layer(
     kind: _Kind, objects: Sequence[KittiObject], chosen: NDArray[np.bool_], calibration: Calibration
 ) -> BoxLayer:
-    own = [item for item, is_chosen in zip(objects, chosen, strict=True) if is_chosen and item.has_box_3d]
-    texts = [kind.text.format(type=item.type, score=item.score or 0.0) for item in own] if kind.text else ()
-    return BoxLayer(kind.title, boxes_from_objects(own, calibration), kind.color, texts, kind.thickness_px)
+    boxed = [item for item, is_chosen in zip(objects, chosen, strict=True) if is_chosen and item.has_box_3d]
+    texts = [kind.text.format(type=item.type, score=item.score or 0.0) for item in boxed] if kind.text else ()
+    return BoxLayer(kind.title, boxes_from_objects(boxed, calibration), kind.color, texts, kind.thickness_px)
 
 
 def _draw_on(image: Image, layers: Sequence[BoxLayer], calibration: Calibration) -> Image:

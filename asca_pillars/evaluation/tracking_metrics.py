@@ -18,7 +18,7 @@ class TrackedFrame(NamedTuple):
 
     objects: Ints
     """(M,) labelled identities."""
-    found: Ints
+    detections: Ints
     """(N,) predicted identities."""
     similarity: Floats
     """(M, N) in 0..1: 3D IoU."""
@@ -33,29 +33,29 @@ class Boxes(NamedTuple):
     """(K,)."""
 
 
-def tracked_frame(labels: Boxes, counted: Mask, found: Boxes) -> TrackedFrame:
+def tracked_frame(labels: Boxes, counted: Mask, detections: Boxes) -> TrackedFrame:
     """Compare the boxes of a frame, without labels that are not counted and without the boxes that found those.
 
     Args:
         labels: M of one class.
         counted: (M,) mask; False for objects of which a detector cannot be asked, hidden or out of its reach.
-        found: N of the same class.
+        detections: N of the same class.
     """
-    similarity = iou_3d(labels.boxes, found.boxes)
+    similarity = iou_3d(labels.boxes, detections.boxes)
     holders = best_assignments(np.where(similarity >= IGNORED_IOU, similarity, 0.0).T)[-1]
     of_ignored = holders[~counted & (holders != UNMATCHED)]
-    kept = np.ones(len(found.ids), bool)
+    kept = np.ones(len(detections.ids), bool)
     kept[of_ignored] = False
-    return TrackedFrame(labels.ids[counted], found.ids[kept], similarity[np.ix_(counted, kept)])
+    return TrackedFrame(labels.ids[counted], detections.ids[kept], similarity[np.ix_(counted, kept)])
 
 
 def counts_of_ids(frames: Sequence[TrackedFrame]) -> tuple[dict[int, int], dict[int, int]]:
     """Count the frames of each labelled and each predicted identity."""
     counts: tuple[dict[int, int], dict[int, int]] = ({}, {})
     for frame in frames:
-        for own, ids in zip(counts, (frame.objects, frame.found), strict=True):
+        for count, ids in zip(counts, (frame.objects, frame.detections), strict=True):
             for number in ids.tolist():
-                own[number] = own.get(number, 0) + 1
+                count[number] = count.get(number, 0) + 1
     return counts
 
 
@@ -78,27 +78,27 @@ class Hota(NamedTuple):
 def hota(sequences: Sequence[Sequence[TrackedFrame]]) -> Hota:
     """Compute HOTA of one class over several sequences with independent identities."""
     numbered = [_renumbered(frames, index) for index, frames in enumerate(sequences)]
-    frames = [frame for own in numbered for frame in own]
-    objects, found = counts_of_ids(frames)
-    if not objects and not found:
+    frames = [frame for sequence in numbered for frame in sequence]
+    objects, detections = counts_of_ids(frames)
+    if not objects and not detections:
         return Hota(*[float("nan")] * 4)
-    scores = np.array([_at(alpha, frames, objects, found) for alpha in ALPHAS])
+    scores = np.array([_at(alpha, frames, objects, detections) for alpha in ALPHAS])
     return Hota(*scores.mean(axis=0).tolist())
 
 
 def _at(
-    alpha: float, frames: Sequence[TrackedFrame], objects: dict[int, int], found: dict[int, int]
+    alpha: float, frames: Sequence[TrackedFrame], objects: dict[int, int], detections: dict[int, int]
 ) -> tuple[float, float, float, float]:
     """Compute HOTA, DetA, AssA and LocA at one threshold."""
     could_match = _pairs(frames, [frame.similarity >= alpha - _ROUNDING for frame in frames])
-    association = {pair: _association(pair, count, objects, found) for pair, count in could_match.items()}
+    association = {pair: _association(pair, count, objects, detections) for pair, count in could_match.items()}
     matched: list[Mask] = []
     similarities = 0.0
     for frame in frames:
         allowed = frame.similarity >= alpha - _ROUNDING
         score = np.zeros(frame.similarity.shape)
         for row, column in zip(*np.nonzero(allowed), strict=True):
-            pair = int(frame.objects[row]), int(frame.found[column])
+            pair = int(frame.objects[row]), int(frame.detections[column])
             score[row, column] = 1 / _EPSILON + association[pair] + _EPSILON * frame.similarity[row, column]
         holders = best_assignments(score)[-1]
         mask = np.zeros(score.shape, bool)
@@ -108,8 +108,8 @@ def _at(
         similarities += float(frame.similarity[mask].sum())
     counts = _pairs(frames, matched)
     tp = sum(counts.values())
-    everything = sum(objects.values()) + sum(found.values()) - tp  # TP + FN + FP
-    total = sum(count * _association(pair, count, objects, found) for pair, count in counts.items())
+    everything = sum(objects.values()) + sum(detections.values()) - tp  # TP + FN + FP
+    total = sum(count * _association(pair, count, objects, detections) for pair, count in counts.items())
     return (
         float(np.sqrt(total / everything)),
         tp / everything,
@@ -118,8 +118,8 @@ def _at(
     )
 
 
-def _association(pair: Pair, both: int, objects: dict[int, int], found: dict[int, int]) -> float:
-    return both / (objects[pair[0]] + found[pair[1]] - both)
+def _association(pair: Pair, both: int, objects: dict[int, int], detections: dict[int, int]) -> float:
+    return both / (objects[pair[0]] + detections[pair[1]] - both)
 
 
 def _pairs(frames: Sequence[TrackedFrame], masks: Sequence[Mask]) -> dict[Pair, int]:
@@ -127,7 +127,7 @@ def _pairs(frames: Sequence[TrackedFrame], masks: Sequence[Mask]) -> dict[Pair, 
     counts: dict[Pair, int] = {}
     for frame, mask in zip(frames, masks, strict=True):
         rows, columns = np.nonzero(mask)
-        for pair in zip(frame.objects[rows].tolist(), frame.found[columns].tolist(), strict=True):
+        for pair in zip(frame.objects[rows].tolist(), frame.detections[columns].tolist(), strict=True):
             counts[pair] = counts.get(pair, 0) + 1
     return counts
 
@@ -135,7 +135,7 @@ def _pairs(frames: Sequence[TrackedFrame], masks: Sequence[Mask]) -> dict[Pair, 
 def _renumbered(frames: Sequence[TrackedFrame], sequence: int) -> list[TrackedFrame]:
     """Return the frames with identities that are unique among all sequences."""
     return [
-        frame._replace(objects=frame.objects + (sequence << 40), found=frame.found + (sequence << 40))
+        frame._replace(objects=frame.objects + (sequence << 40), detections=frame.detections + (sequence << 40))
         for frame in frames
     ]
 
@@ -171,13 +171,13 @@ def clear_mot(sequences: Sequence[Sequence[TrackedFrame]], threshold: float) -> 
         for frame in frames:
             matches = _matches(frame, matched_before, threshold)
             for number in frame.objects.tolist():
-                own = matches.get(number)
-                if own is not None:
-                    total[3] += number in last and last[number] != own
+                identity = matches.get(number)
+                if identity is not None:
+                    total[3] += number in last and last[number] != identity
                     total[4] += number in last and not seen_before[number]
-                    last[number] = own
-                seen_before[number] = own is not None
-            total[:3] += len(frame.objects), len(matches), len(frame.found) - len(matches)
+                    last[number] = identity
+                seen_before[number] = identity is not None
+            total[:3] += len(frame.objects), len(matches), len(frame.detections) - len(matches)
             matched_before = matches
     return ClearMot(*total.tolist())
 
@@ -185,7 +185,9 @@ def clear_mot(sequences: Sequence[Sequence[TrackedFrame]], threshold: float) -> 
 def _matches(frame: TrackedFrame, before: dict[int, int], threshold: float) -> dict[int, int]:
     """Match a frame: object -> identity."""
     similarity = np.where(frame.similarity >= threshold, frame.similarity, 0.0)
-    kept = np.array([[before.get(one) == other for other in frame.found.tolist()] for one in frame.objects.tolist()])
+    kept = np.array(
+        [[before.get(one) == other for other in frame.detections.tolist()] for one in frame.objects.tolist()]
+    )
     if similarity.size:
         kept = kept.reshape(similarity.shape) & (similarity > 0)
         similarity[kept.any(axis=1)] = 0.0
@@ -193,4 +195,4 @@ def _matches(frame: TrackedFrame, before: dict[int, int], threshold: float) -> d
         similarity[kept] = 1.0
     holders = best_assignments(similarity)[-1]
     held = np.flatnonzero(holders != UNMATCHED)
-    return dict(zip(frame.objects[holders[held]].tolist(), frame.found[held].tolist(), strict=True))
+    return dict(zip(frame.objects[holders[held]].tolist(), frame.detections[held].tolist(), strict=True))

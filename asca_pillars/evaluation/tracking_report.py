@@ -80,8 +80,8 @@ class _Frame:
     counted: NDArray[np.bool_]
     outside: int
     hidden: int
-    found: Boxes
-    found_types: tuple[str, ...]
+    detections: Boxes
+    detection_types: tuple[str, ...]
 
 
 def tracking_report(split: BoxSplit, predictions: Path, subject: str, about: dict[str, Any]) -> TrackingReport:
@@ -102,25 +102,27 @@ def tracking_report(split: BoxSplit, predictions: Path, subject: str, about: dic
         DatasetError: as `predictions_by_frame`; boxes have no `track_id`.
     """
     path = predictions / "detections.jsonl" if predictions.is_dir() else predictions
-    found = predictions_by_frame(path, split)
-    scope = stated_scope(path, found.values())
-    predicted = sorted({kind for one in found.values() for kind in one.records.types})
+    by_frame = predictions_by_frame(path, split)
+    scope = stated_scope(path, by_frame.values())
+    predicted = sorted({kind for one in by_frame.values() for kind in one.records.types})
     names = tuple(dict.fromkeys((*(() if scope is None else scope.classes), *predicted)))
     sequences: dict[str, list[_Frame]] = {}
     labelled: Counter[str] = Counter()
     numbers: dict[str, int] = {}
     outside = hidden = 0
     for frame_id in _in_order(split.frame_ids, split.times_s):
-        frame = _frame(split, frame_id, found.get(frame_id), names, scope, numbers)
+        frame = _frame(split, frame_id, by_frame.get(frame_id), names, scope, numbers)
         labelled.update(frame.types)
         outside, hidden = outside + frame.outside, hidden + frame.hidden
         sequences.setdefault(frame_id.rpartition("/")[0], []).append(frame)
     scores = []
     for name in names:
-        frames = [[_of_class(frame, name) for frame in own] for own in sequences.values()]
+        frames = [[_of_class(frame, name) for frame in sequence] for sequence in sequences.values()]
         scores.append(ClassScore(name, hota(frames), clear_mot(frames, CLEAR_IOU)))
     not_scored = {kind: count for kind, count in sorted(labelled.items()) if kind not in names}
-    return TrackingReport(subject, scores, len(split.frame_ids), len(found), not_scored, scope, outside, hidden, about)
+    return TrackingReport(
+        subject, scores, len(split.frame_ids), len(by_frame), not_scored, scope, outside, hidden, about
+    )
 
 
 def tracking_tables(report: TrackingReport) -> list[TextTable]:
@@ -202,20 +204,20 @@ def tracking_json(report: TrackingReport) -> dict[str, Any]:
 
 def _of_class(frame: _Frame, name: str) -> TrackedFrame:
     """Return one class of a frame; boxes that match labels of unpredicted classes are removed."""
-    own = np.array([kind == name for kind in frame.types], bool)
+    of_class = np.array([kind == name for kind in frame.types], bool)
     foreign = np.array([not counted and kind != name for kind, counted in zip(frame.types, frame.counted, strict=True)])
-    rows = np.flatnonzero(own | foreign.astype(bool))
+    rows = np.flatnonzero(of_class | foreign.astype(bool))
     labels = Boxes(frame.labels.boxes[rows], frame.labels.ids[rows])
-    columns = np.flatnonzero(np.array([kind == name for kind in frame.found_types], bool))
+    columns = np.flatnonzero(np.array([kind == name for kind in frame.detection_types], bool))
     return tracked_frame(
-        labels, (frame.counted & own)[rows], Boxes(frame.found.boxes[columns], frame.found.ids[columns])
+        labels, (frame.counted & of_class)[rows], Boxes(frame.detections.boxes[columns], frame.detections.ids[columns])
     )
 
 
 def _frame(
     split: BoxSplit,
     frame_id: str,
-    found: NamedRecords | None,
+    predicted: NamedRecords | None,
     names: Sequence[str],
     scope: DetectorScope | None,
     numbers: dict[str, int],
@@ -230,12 +232,12 @@ def _frame(
         inside = scope.holds(split.labeled_boxes(frame_id).boxes)  # its axes are level, those of labels may not be
     labels = Boxes(records.boxes, _ids(records.track_ids, str(split.labels_path), numbers))
     counts = known & seen & inside, int((known & ~inside).sum()), int((known & inside & ~seen).sum())
-    if found is None:
+    if predicted is None:
         nothing = Boxes(np.empty((0, 7), np.float32), np.empty(0, np.int64))
         return _Frame(labels, records.types, *counts, nothing, ())
-    own = found.records
-    boxes = Boxes(own.boxes, _ids(own.track_ids, found.place, numbers))
-    return _Frame(labels, records.types, *counts, boxes, own.types)
+    prediction_records = predicted.records
+    boxes = Boxes(prediction_records.boxes, _ids(prediction_records.track_ids, predicted.place, numbers))
+    return _Frame(labels, records.types, *counts, boxes, prediction_records.types)
 
 
 def _label_records(split: BoxSplit, frame_id: str) -> list[dict[str, Any]]:

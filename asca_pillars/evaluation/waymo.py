@@ -130,13 +130,15 @@ def waymo_detection(
     """
     class_names = _checked_class_names(truth, detections)
     tallies = {(index, span): _Tally() for index in range(len(class_names)) for span in RANGES_M}
-    zones = [np.zeros(len(found), dtype=bool) for found in detections] if no_label is None else no_label
+    zones = [np.zeros(len(predicted), dtype=bool) for predicted in detections] if no_label is None else no_label
     frames = list(zip(truth, detections, zones, strict=True))
-    for labelled, found, zone in reporter.track(frames, "Evaluating"):
+    for labelled, predicted, zone in reporter.track(frames, "Evaluating"):
         for index, name in enumerate(class_names):
-            own = (labelled.labels == index) & (labelled.levels > 0)
-            detected = found.labels == index
-            frame = _frame(labelled.boxes[own], labelled.levels[own], found[detected], zone[detected], name)
+            of_class = (labelled.labels == index) & (labelled.levels > 0)
+            detected = predicted.labels == index
+            frame = _frame(
+                labelled.boxes[of_class], labelled.levels[of_class], predicted[detected], zone[detected], name
+            )
             for span in RANGES_M:
                 tallies[index, span].add(frame.within(span))
     return [
@@ -189,19 +191,19 @@ class _Frame:
 def _frame(
     boxes: NDArray[np.floating],
     levels: NDArray[np.int64],
-    found: Detections,
+    detections: Detections,
     no_label: NDArray[np.bool_],
     class_name: str,
 ) -> _Frame:
-    order = np.argsort(-found.scores, kind="stable")
-    found = found[order]
-    iou = iou_3d(found.boxes, boxes)
+    order = np.argsort(-detections.scores, kind="stable")
+    detections = detections[order]
+    iou = iou_3d(detections.boxes, boxes)
     iou[iou < min_iou(class_name)] = 0.0
-    turned = wrap_angle(found.boxes[:, None, 6].astype(np.float64) - boxes[None, :, 6])
+    turned = wrap_angle(detections.boxes[:, None, 6].astype(np.float64) - boxes[None, :, 6])
     return _Frame(
-        scores=found.scores,
+        scores=detections.scores,
         no_label=no_label[order],
-        distances_m=np.linalg.norm(found.boxes[:, :3].astype(np.float64), axis=1),
+        distances_m=np.linalg.norm(detections.boxes[:, :3].astype(np.float64), axis=1),
         iou=iou,
         heading_accuracy=1 - np.abs(turned) / np.pi,
         object_distances_m=np.linalg.norm(boxes[:, :3].astype(np.float64), axis=1),
@@ -269,10 +271,10 @@ def _average_precision(recall: _Doubles, precision: _Doubles) -> float:
 def _checked_class_names(truth: Sequence[WaymoTruth], detections: Sequence[Detections]) -> tuple[str, ...]:
     if len(truth) != len(detections) or not truth:
         raise ValueError(f"{len(truth)} labelled frames and {len(detections)} with detections: need the same, not 0")
-    for index, found in enumerate(detections):
-        if found.class_names != detections[0].class_names:
-            raise ValueError(f"frame {index} has classes {found.class_names}, frame 0 {detections[0].class_names}")
-        if not ((found.scores >= 0) & (found.scores <= 1)).all():
+    for index, frame in enumerate(detections):
+        if frame.class_names != detections[0].class_names:
+            raise ValueError(f"frame {index} has classes {frame.class_names}, frame 0 {detections[0].class_names}")
+        if not ((frame.scores >= 0) & (frame.scores <= 1)).all():
             raise ValueError(f"frame {index}: scores must lie within [0, 1]")
     return detections[0].class_names
 
@@ -315,8 +317,8 @@ def waymo_frames(
     """
     result = WaymoFrames([], [], [])
     pairs = list(zip(frames.truth, frames.detections, strict=True))
-    for truth, found in reporter.track(pairs, "Points in boxes"):
-        detections, no_label = _detections(truth, found, tuple(class_names))
+    for truth, detected in reporter.track(pairs, "Points in boxes"):
+        detections, no_label = _detections(truth, detected, tuple(class_names))
         result.truth.append(_truth(truth, class_names, split))
         result.detections.append(detections)
         result.no_label.append(no_label)
@@ -343,23 +345,23 @@ def _truth(objects: FrameObjects, class_names: Sequence[str], split: KittiSplit 
 
 
 def _detections(
-    truth: FrameObjects, found: FrameObjects, class_names: tuple[str, ...]
+    truth: FrameObjects, detected: FrameObjects, class_names: tuple[str, ...]
 ) -> tuple[Detections, NDArray[np.bool_]]:
     """Return the D detections of the classes, and the mask (D,) of those in a substitute of a no-label zone."""
-    labels = _labels(found, class_names)
+    labels = _labels(detected, class_names)
     known = labels >= 0
-    wrong = found.scores[known & ((found.scores < 0) | (found.scores > 1))]
+    wrong = detected.scores[known & ((detected.scores < 0) | (detected.scores > 1))]
     if len(wrong):
         raise DatasetError(
-            f"frame {found.frame_id}: score {wrong[0]:g}; Waymo's metric cuts off at 0, 0.01 .. 1: "
+            f"frame {detected.frame_id}: score {wrong[0]:g}; Waymo's metric cuts off at 0, 0.01 .. 1: "
             "scale the scores of the predictions to [0, 1]"
         )
-    boxes, scores = upright_boxes(found)[known].astype(np.float32), found.scores[known].astype(np.float32)
-    zones = dont_care_shares(Frames.join([truth], [found]))[known] > DONT_CARE_SHARE
+    boxes, scores = upright_boxes(detected)[known].astype(np.float32), detected.scores[known].astype(np.float32)
+    zones = dont_care_shares(Frames.join([truth], [detected]))[known] > DONT_CARE_SHARE
     for label, name in enumerate(class_names):
-        own = labels[known] == label
+        of_class = labels[known] == label
         neighbors = is_neighbor(truth, name) & (_labels(truth, class_names) < 0)
-        zones[own] |= np.any(iou_3d(boxes[own], upright_boxes(truth)[neighbors]) >= min_iou(name), axis=1)
+        zones[of_class] |= np.any(iou_3d(boxes[of_class], upright_boxes(truth)[neighbors]) >= min_iou(name), axis=1)
     return Detections(boxes, scores, labels[known], class_names), zones
 
 
@@ -394,8 +396,8 @@ def waymo_table(report: WaymoReport) -> TextTable:
     rows = []
     for name in dict.fromkeys(score.class_name for score in report.scores):
         for span in RANGES_M:
-            own = [item for item in report.scores if (item.class_name, item.range_m) == (name, span)]
-            by_level = sorted(own, key=lambda item: item.level)
+            scores = [item for item in report.scores if (item.class_name, item.range_m) == (name, span)]
+            by_level = sorted(scores, key=lambda item: item.level)
             cells = [cell for item in by_level for cell in (_percent(item.ap), _percent(item.aph), str(item.objects))]
             rows.append((name, _range_text(span), *cells))
     for span in RANGES_M:

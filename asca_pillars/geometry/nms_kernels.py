@@ -110,15 +110,15 @@ def _nms(boxes: Floats, iou_threshold: float, limit: int, circles: Floats, shape
 )
 def _vote(boxes: Floats, weights: Floats, labels: Ints, kept: Ints, iou_threshold: float, voted: Floats) -> None:
     for row in range(len(kept)):
-        own = kept[row]
-        al, aw, yaw = boxes[own, 3] / 2, boxes[own, 4] / 2, boxes[own, 6]
+        best = kept[row]
+        al, aw, yaw = boxes[best, 3] / 2, boxes[best, 4] / 2, boxes[best, 6]
         cos, sin, reach = math.cos(yaw), math.sin(yaw), math.hypot(al, aw)
-        total = weights[own]
+        total = weights[best]
         voted[row] = 0.0  # sums of weighted differences from the kept box
         for k in range(len(boxes)):
             bl, bw = boxes[k, 3] / 2, boxes[k, 4] / 2
-            dx, dy, reaches = boxes[k, 0] - boxes[own, 0], boxes[k, 1] - boxes[own, 1], math.hypot(bl, bw) + reach
-            if k == own or labels[k] != labels[own] or dx * dx + dy * dy >= reaches * reaches:
+            dx, dy, reaches = boxes[k, 0] - boxes[best, 0], boxes[k, 1] - boxes[best, 1], math.hypot(bl, bw) + reach
+            if k == best or labels[k] != labels[best] or dx * dx + dy * dy >= reaches * reaches:
                 continue
             turn = boxes[k, 6] - yaw
             # The other box in the frame of the kept one.
@@ -130,8 +130,8 @@ def _vote(boxes: Floats, weights: Floats, labels: Ints, kept: Ints, iou_threshol
             weight = weights[k] * shared / union
             total += weight
             for axis in range(6):
-                voted[row, axis] += weight * (boxes[k, axis] - boxes[own, axis])
+                voted[row, axis] += weight * (boxes[k, axis] - boxes[best, axis])
             # Half a turn does not change a footprint: the kept box alone says which end is the front.
             voted[row, 6] += weight * (turn - math.pi * math.floor(turn / math.pi + 0.5))
         for axis in range(7):
-            voted[row, axis] = boxes[own, axis] + (voted[row, axis] / total if total > 0 else 0.0)
+            voted[row, axis] = boxes[best, axis] + (voted[row, axis] / total if total > 0 else 0.0)

@@ -135,10 +135,10 @@ class ScanDetector:
         preparation = self.network.preparation
         batch = to_device(preparation.collate([preparation.prepare(unlabeled, None)]), self._device)
         with torch.inference_mode():
-            found = self.network.detect(self.network.predict(batch), self.spec)[0]
+            detections = self.network.detect(self.network.predict(batch), self.spec)[0]
         if self._to_model is not None:
-            found = replace(found, boxes=self._to_model.inverse.boxes(found.boxes))
-        return found
+            detections = replace(detections, boxes=self._to_model.inverse.boxes(detections.boxes))
+        return detections
 
 
 class OpenedCheckpoint(NamedTuple):

@@ -146,12 +146,12 @@ def require_new_checkpoint(path: Path) -> None:
 
 
 def require_same_arrays(
-    found: Mapping[str, Tensor], expected: Mapping[str, Tensor], path: str | Path, expected_in: str, remedy: str
+    loaded: Mapping[str, Tensor], expected: Mapping[str, Tensor], path: str | Path, expected_in: str, remedy: str
 ) -> None:
     """Compare names and shapes of the arrays of two networks.
 
     Args:
-        found: of the checkpoint at `path`.
+        loaded: of the checkpoint at `path`.
         expected: of the other network.
         path: for the error's text.
         expected_in: where the other network stands, such as "this configuration".
@@ -160,11 +160,11 @@ def require_same_arrays(
     Raises:
         TrainingError: they differ; names the first array that does.
     """
-    for name in {**expected, **found}:
-        theirs, ours = (tuple(each[name].shape) if name in each else "missing" for each in (found, expected))
-        if theirs != ours:
+    for name in {**expected, **loaded}:
+        has, needs = (tuple(each[name].shape) if name in each else "missing" for each in (loaded, expected))
+        if has != needs:
             raise TrainingError(
-                f"{path}: weights of another network: {name} is {theirs} there and {ours} in {expected_in}; {remedy}"
+                f"{path}: weights of another network: {name} is {has} there and {needs} in {expected_in}; {remedy}"
             )
 
 

@@ -157,9 +157,9 @@ def _draw_points(canvas: Image, camera: ChaseCamera, points: NDArray[np.float64]
     shades = np.round(np.array(_HAZE) + clear * (colors - np.array(_HAZE))).astype(np.uint8)
     sizes = np.clip(np.round(_POINT_M * camera._focal_px / depth), *_POINT_PX).astype(int)
     for size in range(_POINT_PX[0], _POINT_PX[1] + 1):  # the near are the large: the order by depth is kept
-        own = sizes == size
-        columns, rows = (pixels[own] - (size - 1) / 2).astype(np.int64).T
-        shade = shades[own]
+        of_size = sizes == size
+        columns, rows = (pixels[of_size] - (size - 1) / 2).astype(np.int64).T
+        shade = shades[of_size]
         for down in range(size):
             for right in range(size):
                 if size >= 4 and down in (0, size - 1) and right in (0, size - 1):
@@ -226,8 +226,8 @@ def _draw_boxes(texts: Texts, camera: ChaseCamera, layers: Sequence[BoxLayer]) -
             width, height = texts.size(text)
             places = [(column - width / 2, row - lift) for lift in (2, 1.5 * height, 2.8 * height, 4.1 * height)]
             columns = camera.project(corners(box[None])[0])[0][:, 0]
-            beside = [(columns.max() + 8, row), (columns.min() - width - 8, row)]
-            texts.put(text, places + beside, layer.color)
+            sides = [(columns.max() + 8, row), (columns.min() - width - 8, row)]
+            texts.put(text, places + sides, layer.color)
 
 
 def _draw_box(canvas: Image, camera: ChaseCamera, box: NDArray[np.float64], layer: BoxLayer, depth_m: float) -> None:

@@ -47,8 +47,8 @@ def find_encoder() -> str:
         import imageio_ffmpeg
 
         return str(imageio_ffmpeg.get_ffmpeg_exe())
-    if found := shutil.which("ffmpeg"):
-        return found
+    if ffmpeg := shutil.which("ffmpeg"):
+        return ffmpeg
     raise AscaError(f"a video needs ffmpeg, which is not here: {install_command('video')}")
 
 
@@ -185,11 +185,11 @@ class BoxVideo:
             texts = [f"{name} {number}" for name, number in zip(detections.names, track_ids.tolist(), strict=True)]
         if self._level is not None:
             points, boxes = self._level.points(points), self._level.boxes(boxes)
-        found = Detections(boxes.astype(np.float32), detections.scores, detections.labels, detections.class_names)
+        shown = Detections(boxes.astype(np.float32), detections.scores, detections.labels, detections.class_names)
         if self._ground_m is None and len(points):
             heights = points[:, 2]
             self._ground_m = ground_height(heights[np.isfinite(heights)])
-        layers = class_layers(found, texts=texts)
+        layers = class_layers(shown, texts=texts)
         width_px = WIDTH_PX[self._view]
         options = {"width_px": width_px, "trails": trails, "ground_m": self._ground_m}
         if self._view == "chase":
@@ -206,14 +206,14 @@ class BoxVideo:
         """Extend the boxes' trails by their places; return the trails of these boxes in the picture's frame."""
         boxes = detections.boxes.astype(np.float64)
         floors = np.column_stack([boxes[:, :2], boxes[:, 2] - boxes[:, 5] / 2])
-        here = np.linalg.inv(pose)
+        from_world = np.linalg.inv(pose)
         trails = []
         for number, floor, name in zip(track_ids.tolist(), floors, detections.names, strict=True):
             trail = self._trails.setdefault(number, deque())
             trail.append((time_s, pose[:3, :3] @ floor + pose[:3, 3]))
             while abs(time_s - trail[0][0]) > TRAIL_S:
                 trail.popleft()
-            places = np.stack([place for _, place in trail]) @ here[:3, :3].T + here[:3, 3]
+            places = np.stack([place for _, place in trail]) @ from_world[:3, :3].T + from_world[:3, 3]
             if self._level is not None:
                 places = self._level.points(places)
             trails.append(Trail(places, class_color(name)))

@@ -101,13 +101,13 @@ def class_layers(
 
     `texts` stand beside the detections, in their order; None for the scores.
     """
-    found = Detections.empty(()) if detections is None else detections
-    texts = [f"{score:.2f}" for score in found.scores] if texts is None else texts
+    drawn = Detections.empty(()) if detections is None else detections
+    texts = [f"{score:.2f}" for score in drawn.scores] if texts is None else texts
     layers = []
-    for label, name in enumerate(found.class_names):
-        own = found.labels == label
-        named = [text for text, mine in zip(texts, own, strict=True) if mine]
-        layers.append(BoxLayer(name, found.boxes[own], class_color(name), named))
+    for label, name in enumerate(drawn.class_names):
+        of_class = drawn.labels == label
+        named = [text for text, mine in zip(texts, of_class, strict=True) if mine]
+        layers.append(BoxLayer(name, drawn.boxes[of_class], class_color(name), named))
     if labels is not None and len(labels):
         layers.append(BoxLayer("ground truth", labels, _WHITE, thickness_px=2))
     return layers

@@ -58,19 +58,19 @@ def files_below(folder: Path) -> Iterator[Path]:
     visited: set[tuple[int, int]] = set()
     folders, links = [folder], deque[Path]()
     while folders or links:
-        here = folders.pop() if folders else links.popleft()
+        current = folders.pop() if folders else links.popleft()
         try:
-            if (identity := _folder_identity(here)) in visited or _is_prepared(here):
+            if (identity := _folder_identity(current)) in visited or _is_prepared(current):
                 continue
             visited.add(identity)
-            entries = sorted(os.scandir(here), key=lambda entry: entry.name)
+            entries = sorted(os.scandir(current), key=lambda entry: entry.name)
         except OSError:
             continue
         for entry in entries:
             if not _is_folder(entry):
-                yield here / entry.name
+                yield current / entry.name
             else:
-                (links if entry.is_symlink() else folders).append(here / entry.name)
+                (links if entry.is_symlink() else folders).append(current / entry.name)
 
 
 def _folder_identity(folder: Path) -> tuple[int, int]:

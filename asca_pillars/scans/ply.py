@@ -48,8 +48,8 @@ def read_ply(path: Path) -> StoredPoints:
     encoding, elements, body = _split_header(path, path.read_bytes())
     names = [element.name for element in elements]
     if names.count("vertex") != 1:
-        found = "two elements vertex" if "vertex" in names else "no element vertex"
-        raise ScanError(f"{path}: {found} among {', '.join(names) or 'none'}; export one point cloud")
+        vertices = "two elements vertex" if "vertex" in names else "no element vertex"
+        raise ScanError(f"{path}: {vertices} among {', '.join(names) or 'none'}; export one point cloud")
     index = names.index("vertex")
     vertex = elements[index]
     if vertex.has_lists:

@@ -47,14 +47,14 @@ class Transforms:
     def _upwards(self, frame: str) -> dict[str, NDArray[np.float64]]:
         """Return the matrices from the frame to itself, its parent and all further ancestors."""
         matrix = np.eye(4)
-        found = {frame: matrix}
+        matrices = {frame: matrix}
         while frame in self._parents:
             frame, step = self._parents[frame]
-            if frame in found:  # a cycle
+            if frame in matrices:  # a cycle
                 break
             matrix = step @ matrix
-            found[frame] = matrix
-        return found
+            matrices[frame] = matrix
+        return matrices
 
 
 def read_static_transforms(recording: Recording, frame: str) -> Transforms:
@@ -140,8 +140,8 @@ def read_poses(recording: Recording, topic: str) -> Poses:
     """
     kinds = {one.name: one.type for one in recording.topics}
     if kinds.get(topic) not in ODOMETRY_TYPES:
-        there = ", ".join(name for name, kind in kinds.items() if kind in ODOMETRY_TYPES) or "no such topic"
-        raise ScanError(f"{recording.path}: {topic[:80]} holds no nav_msgs/msg/Odometry; there is {there}")
+        odometry_topics = ", ".join(name for name, kind in kinds.items() if kind in ODOMETRY_TYPES) or "no such topic"
+        raise ScanError(f"{recording.path}: {topic[:80]} holds no nav_msgs/msg/Odometry; there is {odometry_topics}")
     rows, trouble = [], "no message"
     for message in recording.messages(topic):
         try:

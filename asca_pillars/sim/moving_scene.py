@@ -214,8 +214,8 @@ class MovingScene:
         times = np.array([time_s - self.duration_s / 2])
         driven = float(self.ego.at(times).xy_m[0, 0])
         ground = self.scene.ground
-        here, there = ground.heights([(0.0, 0.0), (driven, 0.0)])
-        lifted = float(there - here)  # the sensor's height above the street is constant
+        start_ground_m, ego_ground_m = ground.heights([(0.0, 0.0), (driven, 0.0)])
+        lifted = float(ego_ground_m - start_ground_m)  # the sensor's height above the street is constant
         street = ground.street._replace(along_m=driven, cross_u_m=ground.street.cross_u_m - driven)
         targets, ids, velocities = [], [], []
         for index, (target, way) in enumerate(zip(self.scene.targets, self.trajectories, strict=True)):

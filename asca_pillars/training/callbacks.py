@@ -86,9 +86,9 @@ class BestCheckpoint(ModelCheckpoint):
             with contextlib.suppress(*_UNREADABLE, *_OTHERWISE_FILLED):  # then the next validation replaces it
                 state = read_plain(path)["callbacks"][self.state_key]
                 # Lightning forgets the loss where the folder has another name: a run may have been moved.
-                here = {"dirpath": self.dirpath, "best_model_path": str(path), "kth_best_model_path": str(path)}
+                places = {"dirpath": self.dirpath, "best_model_path": str(path), "kth_best_model_path": str(path)}
                 best = {str(path): loss for loss in state["best_k_models"].values()}
-                self.load_state_dict({**state, **here, "best_k_models": best})
+                self.load_state_dict({**state, **places, "best_k_models": best})
 
 
 class LastCheckpoint(Checkpoint):
@@ -156,8 +156,8 @@ def _unusable_reason(path: Path, model: ModelConfig) -> str | None:
         if not isinstance(content[name], kind):
             return f"is damaged (`{name}` is a {type(content[name]).__name__})"
     expected = {f"detector.{name}": array.shape for name, array in build_model(model).state_dict().items()}
-    found = {name: getattr(array, "shape", None) for name, array in content["state_dict"].items()}
-    if wrong := [name for name in expected if found.get(name) != expected[name]]:
+    shapes = {name: getattr(array, "shape", None) for name, array in content["state_dict"].items()}
+    if wrong := [name for name in expected if shapes.get(name) != expected[name]]:
         return f"is of another network ({wrong[0].removeprefix('detector.')} differs)"
     return None
 
@@ -193,13 +193,13 @@ def initial_weights(config: Config, init: Path | None) -> dict[str, Any]:
                 "the checkpoint or bundle of a trained one with --init"
             )
         return {}
-    theirs, ours = (
+    loaded, expected = (
         {name: array for name, array in weights.items() if not alone or name.startswith(_FIRST_STAGE)}
         for weights in (load_checkpoint(init).detector.state_dict(), build_model(config.model).state_dict())
     )
     remedy = "model.spec and model.network have to be like those that it was trained with"
-    require_same_arrays(theirs, ours, init, "this configuration", remedy)
-    return theirs
+    require_same_arrays(loaded, expected, init, "this configuration", remedy)
+    return loaded
 
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)  # Ctrl-C; what `kill`, systemd and batch systems send

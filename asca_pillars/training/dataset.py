@@ -116,8 +116,8 @@ def _no_boxes_reason(names: list[str], labels: _Labels) -> str:
     if outside := [name for name in names if labels.types[name]]:
         count = sum(labels.types[name] for name in outside)
         return f"{count} lie outside the ranges of model.spec.grid; widen them, see `asca inspect`"
-    there = ", ".join(f"{kind} {count}" for kind, count in labels.types.most_common(10)) or "none at all"
-    return f"labels there: {there}; list other frames in ImageSets/, or take other classes (`asca inspect --propose`)"
+    types = ", ".join(f"{kind} {count}" for kind, count in labels.types.most_common(10)) or "none at all"
+    return f"labels there: {types}; list other frames in ImageSets/, or take other classes (`asca inspect --propose`)"
 
 
 @dataclass(frozen=True)

@@ -178,6 +178,6 @@ class EpochSampler(Sampler[list[tuple[int, int]]]):
             order = np.random.default_rng((self.seed, epoch)).permutation(self.frames)
         else:
             order = np.resize(order, math.ceil(self.frames / self.world_size) * self.world_size)
-        own = order[self.rank :: self.world_size].tolist()
-        batches = [own[i * self.batch_size : (i + 1) * self.batch_size] for i in range(start, len(self))]
+        rank_order = order[self.rank :: self.world_size].tolist()
+        batches = [rank_order[i * self.batch_size : (i + 1) * self.batch_size] for i in range(start, len(self))]
         return iter([[(epoch, number) for number in batch] for batch in batches])

@@ -71,8 +71,8 @@ class DetectionModule(L.LightningModule):
         outputs = self.detector.predict(batch.inputs)
         terms = self.detector.loss(outputs, batch.inputs)
         self.log_dict(_named(terms, "val"), sync_dist=True, batch_size=len(batch.frame_ids))
-        found = self.detector.detect(outputs, self.config.model.spec)
-        for detections, boxes, labels in zip(found, batch.boxes, batch.labels, strict=True):
+        per_frame = self.detector.detect(outputs, self.config.model.spec)
+        for detections, boxes, labels in zip(per_frame, batch.boxes, batch.labels, strict=True):
             self.recall.add(detections, boxes, labels)
 
     def on_validation_epoch_end(self) -> None:
@@ -84,8 +84,8 @@ class DetectionModule(L.LightningModule):
             self.log(f"val/recall/{name}", row.recall)
             self.log(f"val/false_per_frame/{name}", row.false_per_frame)
         if not self.trainer.sanity_checking:
-            found = ", ".join(f"{name} {row.recall:.2f} ({row.false_per_frame:.2f})" for name, row in rows.items())
-            self.print(f"epoch {self.current_epoch + 1}: recall (false per frame): {found}")
+            recalls = ", ".join(f"{name} {row.recall:.2f} ({row.false_per_frame:.2f})" for name, row in rows.items())
+            self.print(f"epoch {self.current_epoch + 1}: recall (false per frame): {recalls}")
         self.recall = RecallTally(self.config.model.spec.class_names)
 
     def configure_optimizers(self) -> Any:

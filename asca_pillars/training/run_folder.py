@@ -83,13 +83,13 @@ def claim_run_folder(out: Path, config: Config, inputs: TrainingInputs, steps: i
     """
     path, frames_path = out / CONFIG_FILE, out / FRAMES_FILE
     require_own_file(path, COMMAND, is_own_config)
-    found = read_settings(TrainingInputs, frames_path, (), {}) if frames_path.exists() else None
+    earlier = read_settings(TrainingInputs, frames_path, (), {}) if frames_path.exists() else None
     refusal = _other_run_reason(path, config, inputs, steps) if path.exists() else None
-    refusal = refusal or (found and _other_inputs_reason(frames_path, found, inputs))
+    refusal = refusal or (earlier and _other_inputs_reason(frames_path, earlier, inputs))
     if refusal and any((out / "checkpoints").glob("*.ckpt")):
         raise TrainingError(refusal)
-    if inputs.initial_sha256 is None and found is not None:
-        inputs = inputs._replace(initial_sha256=found.initial_sha256)
+    if inputs.initial_sha256 is None and earlier is not None:
+        inputs = inputs._replace(initial_sha256=earlier.initial_sha256)
     if refusal or not path.exists():
         write_json(out / ENVIRONMENT_FILE, describe_environment())
     write_text(path, YAML_HEAD + yaml.safe_dump(to_dict(config), sort_keys=False))
@@ -130,9 +130,9 @@ def measure_input(out: Path, frames: TrainingFrames, *, keep: bool, reporter: Re
 def _other_run_reason(path: Path, config: Config, inputs: TrainingInputs, steps: int) -> str | None:
     """Return in words how `config` differs from the run that `path` is of; None if it is the same run, or longer."""
     found_config = load_config(path)  # a run of an older version lacks keys that are younger, not their values
-    found = to_dict(found_config)
+    earlier = to_dict(found_config)
     if found_config.train.precision == "auto":  # an older version, which did not record the resolved value
-        found["train"]["precision"] = config.train.precision
+        earlier["train"]["precision"] = config.train.precision
     longer = config.train.epochs > found_config.train.epochs
     recipe = found_config.train
     planned = recipe.epochs * steps_per_epoch(recipe, inputs.frames, inputs.processes)
@@ -140,8 +140,8 @@ def _other_run_reason(path: Path, config: Config, inputs: TrainingInputs, steps:
         recipe.schedule == "warmup_stable_decay" and steps <= cooldown_start(recipe, planned)
     )
     if longer and extendable:
-        found["train"]["epochs"] = config.train.epochs
-    difference = _first_difference(found, to_dict(config))
+        earlier["train"]["epochs"] = config.train.epochs
+    difference = _first_difference(earlier, to_dict(config))
     if difference is None:
         return None
     if longer and difference.startswith("train.epochs"):
@@ -157,32 +157,32 @@ def _other_run_reason(path: Path, config: Config, inputs: TrainingInputs, steps:
     return f"{path}: the run there was started with {difference}; choose another --out, or delete it"
 
 
-def _other_inputs_reason(path: Path, found: TrainingInputs, inputs: TrainingInputs) -> str | None:
+def _other_inputs_reason(path: Path, earlier: TrainingInputs, inputs: TrainingInputs) -> str | None:
     """Return in words how `inputs` differs from that of the run in `path`; None if it does not."""
-    if found.processes != inputs.processes:
+    if earlier.processes != inputs.processes:
         return (
-            f"{path}: the run there was started with {found.processes} process(es), now {inputs.processes}: its steps "
-            "would be others; give as many --devices, or start a new run in another --out with --init"
+            f"{path}: the run there was started with {earlier.processes} process(es), now {inputs.processes}: its "
+            "steps would be others; give as many --devices, or start a new run in another --out with --init"
         )
-    if found[:2] != inputs[:2]:
+    if earlier[:2] != inputs[:2]:
         return (
-            f"{path}: the run there was started on {found.frames} frames, now there are {inputs.frames}, or others; "
+            f"{path}: the run there was started on {earlier.frames} frames, now there are {inputs.frames}, or others; "
             "give it the same --data and data.train_set, or start a new run in another --out with --init"
         )
-    if None not in (found.initial_sha256, inputs.initial_sha256) and found.initial_sha256 != inputs.initial_sha256:
+    if None not in (earlier.initial_sha256, inputs.initial_sha256) and earlier.initial_sha256 != inputs.initial_sha256:
         return (
-            f"{path}: the run there was started from {'other' if found.initial_sha256 else 'random'} weights; leave "
+            f"{path}: the run there was started from {'other' if earlier.initial_sha256 else 'random'} weights; leave "
             "--init out to resume it, or start a new run in another --out"
         )
     return None
 
 
-def _first_difference(found: Any, expected: Any, key: str = "") -> str | None:
+def _first_difference(earlier: Any, expected: Any, key: str = "") -> str | None:
     if key in NOT_OF_THE_RUN:
         return None
-    if isinstance(found, dict) and isinstance(expected, dict):
-        for name in expected | found:
-            if difference := _first_difference(found.get(name), expected.get(name), f"{key}.{name}".lstrip(".")):
+    if isinstance(earlier, dict) and isinstance(expected, dict):
+        for name in expected | earlier:
+            if difference := _first_difference(earlier.get(name), expected.get(name), f"{key}.{name}".lstrip(".")):
                 return difference
         return None
-    return None if found == expected else f"{key} = {found}, now {key} = {expected}"
+    return None if earlier == expected else f"{key} = {earlier}, now {key} = {expected}"

@@ -120,18 +120,18 @@ def ranges_around(ranges: Ranges, passes: int) -> Ranges:
     return Ranges((-reach, reach), (-reach, reach), ranges.z_m)
 
 
-def without_own_vehicle(found: Detections) -> Detections:
+def without_own_vehicle(detections: Detections) -> Detections:
     """Return the boxes that the sensor is not in; one that it is in, seen from above, is the vehicle that carries it.
 
     KITTI's sensor sees nothing of its car, and the simulated one neither. Others see its roof or bonnet, which a model
     takes for another car.
 
     Args:
-        found: in the model's frame, whose z axis leads through the sensor or the vehicle.
+        detections: in the model's frame, whose z axis leads through the sensor or the vehicle.
     """
-    x, y, _, length, width, _, yaw = found.boxes.astype(np.float64).T
+    x, y, _, length, width, _, yaw = detections.boxes.astype(np.float64).T
     along, across = x * np.cos(yaw) + y * np.sin(yaw), y * np.cos(yaw) - x * np.sin(yaw)
-    return found[(np.abs(along) > length / 2) | (np.abs(across) > width / 2)]
+    return detections[(np.abs(along) > length / 2) | (np.abs(across) > width / 2)]
 
 
 def merge(passes: Sequence[Detections], turns: Sequence[FrameChange], nms_iou: float) -> Detections:
@@ -144,13 +144,13 @@ def merge(passes: Sequence[Detections], turns: Sequence[FrameChange], nms_iou: f
     """
     half_sector = _HALF_TURN_RAD / len(passes)
     boxes, scores, labels, off_ahead = [], [], [], []
-    for found, turn in zip(passes, turns, strict=True):
-        angles = np.abs(np.arctan2(found.boxes[:, 1], found.boxes[:, 0]))
-        own = angles <= half_sector + SEAM_MARGIN_RAD
-        boxes.append(turn.inverse.boxes(found.boxes[own]))
-        scores.append(found.scores[own])
-        labels.append(found.labels[own])
-        off_ahead.append(angles[own])
+    for detections, turn in zip(passes, turns, strict=True):
+        angles = np.abs(np.arctan2(detections.boxes[:, 1], detections.boxes[:, 0]))
+        in_sector = angles <= half_sector + SEAM_MARGIN_RAD
+        boxes.append(turn.inverse.boxes(detections.boxes[in_sector]))
+        scores.append(detections.scores[in_sector])
+        labels.append(detections.labels[in_sector])
+        off_ahead.append(angles[in_sector])
     all_boxes, all_scores, all_labels = np.concatenate(boxes), np.concatenate(scores), np.concatenate(labels)
     nearness = -np.concatenate(off_ahead)
     survivors = nms_by_class(all_boxes, nearness, all_labels, nms_iou)
@@ -160,7 +160,7 @@ def merge(passes: Sequence[Detections], turns: Sequence[FrameChange], nms_iou: f
         all_scores[best],
         all_labels[best],
         passes[0].class_names,
-        non_finite=sum(found.non_finite for found in passes),
+        non_finite=sum(detections.non_finite for detections in passes),
     )
 
 

@@ -115,7 +115,7 @@ def summary(runs_on: str, candidates: Iterable[Candidate]) -> str:
     return f"auto takes {runs_on}: {'; '.join(map(str, candidates))}"
 
 
-def disagreement(expected: Detections, found: Detections, spec: DetectorSpec) -> str | None:
+def disagreement(expected: Detections, actual: Detections, spec: DetectorSpec) -> str | None:
     """Return the first box of either side without a partner on the other; None if every box has one.
 
     Partners have the same class and are as near as the limits above demand. A box whose score ties with its class's
@@ -123,7 +123,7 @@ def disagreement(expected: Detections, found: Detections, spec: DetectorSpec) ->
     """
     if not (~_are_score_ties(expected, spec)).any():
         return "unproven, the sample scan shows no clear object with this model"
-    for boxes, partners, what in ((expected, found, "misses"), (found, expected, "invents")):
+    for boxes, partners, what in ((expected, actual, "misses"), (actual, expected, "invents")):
         lone = np.flatnonzero(~_have_matches(boxes, partners) & ~_are_score_ties(boxes, spec))
         for index in lone[:1]:
             x_m, y_m = boxes.boxes[index, :2]

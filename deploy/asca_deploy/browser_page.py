@@ -113,8 +113,8 @@ def find_ort_web(given: Path | None) -> Path:
     Raises:
         ConfigError: there is none; says how to get it.
     """
-    here = [Path("node_modules/onnxruntime-web"), *sorted(Path().glob("onnxruntime-web-*.tgz"))]
-    for path in [given] if given else here:
+    local = [Path("node_modules/onnxruntime-web"), *sorted(Path().glob("onnxruntime-web-*.tgz"))]
+    for path in [given] if given else local:
         if path.exists():
             return path
     where = f"{given}: no such file or folder" if given else "npm's package onnxruntime-web is not in this folder"

@@ -180,8 +180,8 @@ def detect_archive(
     shard_size = min(max(len(scans) // _SHARDS_WANTED, _SHARD_SCANS[0]), _SHARD_SCANS[1])
     size = folder.begin(_results_depend_on(job, scans), shard_size)
     shards = make_shards([(str(path), scan_input.scale(path)) for path in scans], size)
-    there = folder.done(reporter.track(shards, "Checking what is done"))
-    todo = [shard for shard in shards if shard.name not in there]
+    complete = folder.done(reporter.track(shards, "Checking what is done"))
+    todo = [shard for shard in shards if shard.name not in complete]
     done = len(scans) - sum(len(shard.items) for shard in todo)
     repeats = _process(job, folder, todo, done, address, reporter)
     counts = merge(folder.lines(shards), out)
@@ -239,9 +239,9 @@ def _process(
         if outcome.shard.name not in whole:
             parts.append(outcome.shard)
     for shard in todo:
-        own = list(_within(parts, shard))
-        if own:
-            folder.join(shard, own)
+        shard_parts = list(_within(parts, shard))
+        if shard_parts:
+            folder.join(shard, shard_parts)
     return repeats
 
 

@@ -231,9 +231,9 @@ def detect_scans(
                 tracks = tracker(detections, times_ns[number] * 1e-9)
                 detections = cast("ScanDetections", tracks.detections)  # a part of these
             results.append(DetectedScan(path, scan.notes, detections, tracks))
-            found = FrameResult(number, times_ns[number], FRAME_ID, detections, tracks)
+            result = FrameResult(number, times_ns[number], FRAME_ID, detections, tracks)
             for file in opened:
-                file.write(found, scan.points)
+                file.write(result, scan.points)
             try:
                 if writer is not None:
                     writer(path, name, scan, detections, tracks, None if times is None else times_ns[number])

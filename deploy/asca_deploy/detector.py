@@ -269,8 +269,8 @@ class Detector:
             frame.stage_times.append((_WAITING, perf_counter()))
             return frame, [self.pipeline.infer(one, frame.stage_times) for one in prepared]
 
-        def finish(found: tuple[_Frame, list[Any]]) -> ScanDetections:
-            frame, raw = found
+        def finish(detections: tuple[_Frame, list[Any]]) -> ScanDetections:
+            frame, raw = detections
             frame.stage_times.append((_WAITING, perf_counter()))
             return self._finish(frame, raw)
 
@@ -294,20 +294,20 @@ class Detector:
         prepared = self.pipeline.prepare(points, frame.stage_times)
         if not frame.counts:
             expected, model_ranges = self.bundle.expected_input, self.spec.ranges if self.view == "ahead" else None
-            found = check_input(frame.usable.unclipped, prepared.counts, expected, self.mounting, model_ranges)
-            frame.warnings[:0] = found
+            warnings = check_input(frame.usable.unclipped, prepared.counts, expected, self.mounting, model_ranges)
+            frame.warnings[:0] = warnings
             frame.stage_times.append(("input", perf_counter()))
         frame.counts.append(prepared.counts)
         return prepared
 
     def _finish(self, frame: _Frame, raw: list[Any]) -> ScanDetections:
-        found = [self.pipeline.finish(one, frame.stage_times) for one in raw]
+        passes = [self.pipeline.finish(one, frame.stage_times) for one in raw]
         if self.view == "around":
-            found = [without_own_vehicle(one) for one in found]
+            passes = [without_own_vehicle(one) for one in passes]
         if self.passes == 1:
-            detections, counts = found[0], frame.counts[0]
+            detections, counts = passes[0], frame.counts[0]
         else:
-            detections, counts = merge(found, frame.turns, self.spec.post.nms_iou), sum_counts(frame.counts)
+            detections, counts = merge(passes, frame.turns, self.spec.post.nms_iou), sum_counts(frame.counts)
         if not self._to_model.is_identity:
             detections = replace(detections, boxes=self._to_model.inverse.boxes(detections.boxes))
         frame.stage_times.append((self.pipeline.stages[-1], perf_counter()))

@@ -105,8 +105,8 @@ def golden_stages(pipeline: PillarPipeline | RefinePipeline, points: NDArray[np.
         "scores": sigmoid(candidates.logits),
         "labels": candidates.labels,
     }
-    found = suppress(candidates, spec.classes, spec.post)
-    return {**stages, "neck+head": _head_arrays(answer), "decode": boxes, "suppress": _detections(found)}
+    detections = suppress(candidates, spec.classes, spec.post)
+    return {**stages, "neck+head": _head_arrays(answer), "decode": boxes, "suppress": _detections(detections)}
 
 
 def _second_stage(pipeline: RefinePipeline, first: FirstStageOutputs, points: NDArray[np.float32]) -> Stages:
@@ -114,18 +114,18 @@ def _second_stage(pipeline: RefinePipeline, first: FirstStageOutputs, points: ND
     scan = refine_scan(points, proposed, proposed.proposals, pipeline.section.neighbors)
     inputs = refine_inputs(scan)
     confidence, residuals = pipeline.refine(inputs)
-    found = reported_detections(proposed.proposals, confidence, residuals, pipeline.spec, pipeline.section.scores)
+    detections = reported_detections(proposed.proposals, confidence, residuals, pipeline.spec, pipeline.section.scores)
     return {
         "neck+head": {**_head_arrays(HeadOutputs(first.maps, first.cells)), "neck": first.neck},
         "propose": _detections(proposed.proposals),
         "neighbors": inputs,
         "refine": {"confidence": confidence, "residuals": residuals},
-        "suppress": _detections(found),
+        "suppress": _detections(detections),
     }
 
 
-def _detections(found: Detections) -> dict[str, NDArray[Any]]:
-    return {"boxes": found.boxes, "scores": found.scores, "labels": found.labels}
+def _detections(detections: Detections) -> dict[str, NDArray[Any]]:
+    return {"boxes": detections.boxes, "scores": detections.scores, "labels": detections.labels}
 
 
 def _placed(placed: Any) -> dict[str, NDArray[Any]]:

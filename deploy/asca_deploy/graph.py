@@ -53,16 +53,16 @@ def check_interface(
         BundleError: it does not; names the file, the input or output and the remedy.
     """
     _compare(path, "input", session.inputs, inputs)
-    found = session.outputs
+    available = session.outputs
     for name in outputs:
-        if name not in found:
-            raise BundleError(f"{path} has no output `{name}`, only {', '.join(found)}; export the bundle again")
-    _compare(path, "output", {name: found[name] for name in outputs}, outputs)
+        if name not in available:
+            raise BundleError(f"{path} has no output `{name}`, only {', '.join(available)}; export the bundle again")
+    _compare(path, "output", {name: available[name] for name in outputs}, outputs)
     return session
 
 
-def _compare(path: Path, kind: str, found: Mapping[str, Tensor], expected: Mapping[str, Tensor]) -> None:
-    for name, tensor in found.items():
+def _compare(path: Path, kind: str, tensors: Mapping[str, Tensor], expected: Mapping[str, Tensor]) -> None:
+    for name, tensor in tensors.items():
         if name not in expected:
             raise BundleError(
                 f"{path} has an unknown {kind} `{name}`, the runtime knows {', '.join(expected)}; "

@@ -161,12 +161,12 @@ def inspect_scans(
         of_topic = f" of {recorded.topic.name}" if recorded else ""
         why = f": {reason}" if (reason := next(iter(error_texts), damage)) else ""
         raise ScanError(f"{path}: none of the {source.to_read} scans{of_topic} can be read{why}")
-    found = [*source.notes, *([doubt] if doubt else []), *repairs_of(measured.notes)]
+    findings = [*source.notes, *([doubt] if doubt else []), *repairs_of(measured.notes)]
     scan_times = _scan_times(times) if recorded else None
     if scan_times is not None:
-        found += _odd_times(scan_times, [stamp for _, stamp in times])
+        findings += _odd_times(scan_times, [stamp for _, stamp in times])
     if len(frame_ids) > 1:
-        found.append(f"the scans are in {len(frame_ids)} frames: {', '.join(frame_ids)[:200]}")
+        findings.append(f"the scans are in {len(frame_ids)} frames: {', '.join(frame_ids)[:200]}")
     problems = [f"{_count(len(error_texts), 'scan')} cannot be read: {error_texts[0]}"] if error_texts else []
     return ScansInspection(
         path=str(path),
@@ -190,7 +190,7 @@ def inspect_scans(
         inside_share=spread(np.array(measured.inside)),
         height=height,
         notes=recorded.recording.notes if recorded else (),
-        findings=tuple(found),
+        findings=tuple(findings),
         problems=(*([damage] if damage else []), *problems),
     )
 
@@ -309,14 +309,14 @@ def _scan_times(times: Sequence[tuple[int, int]]) -> ScanTimes:
     return ScanTimes(seconds, 1 / usual_s, len(gaps), missing, float(steps[longest]), int(numbers[longest]))
 
 
-def _odd_times(found: ScanTimes, stamps: Sequence[int]) -> list[str]:
+def _odd_times(times: ScanTimes, stamps: Sequence[int]) -> list[str]:
     """Return sentences about stamps that go back or jump, and about gaps."""
     note = timestamp_note(stamps)
     notes = [note] if note else []
-    if found.gaps:
+    if times.gaps:
         notes.append(
-            f"{_count(found.gaps, 'gap')} in the time stamps, the longest of {found.longest_gap_s:.3g} s after scan "
-            f"{found.longest_gap_after}: at the usual rate {_count(found.missing, 'scan')} more would be there"
+            f"{_count(times.gaps, 'gap')} in the time stamps, the longest of {times.longest_gap_s:.3g} s after scan "
+            f"{times.longest_gap_after}: at the usual rate {_count(times.missing, 'scan')} more would be there"
         )
     return notes
 

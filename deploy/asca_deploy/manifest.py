@@ -94,8 +94,8 @@ def first_parsing_difference(written: Any, understood: Any) -> str | None:
     if isinstance(understood, list):
         if not isinstance(written, list) or len(written) != len(understood):
             return "*"
-        for index, (ours, theirs) in enumerate(zip(written, understood, strict=True)):
-            if inner := first_parsing_difference(ours, theirs):
+        for index, (written_value, understood_value) in enumerate(zip(written, understood, strict=True)):
+            if inner := first_parsing_difference(written_value, understood_value):
                 return str(index) if inner == "*" else f"{index}.{inner}"
         return None
     if isinstance(understood, float) and type(written) is int:
@@ -111,11 +111,11 @@ def refuse_run_folder(folder: Path) -> None:
 
 
 def _without_duplicates(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    found = dict(pairs)
-    if len(found) < len(pairs):
+    members = dict(pairs)
+    if len(members) < len(pairs):
         twice = next(key for number, (key, _) in enumerate(pairs) if key in dict(pairs[:number]))
         raise ValueError(f"key `{printable(twice, LONGEST_REASON)}` is there twice")
-    return found
+    return members
 
 
 def _no_number(word: str) -> Any:
@@ -148,12 +148,12 @@ def read_metadata(model: bytes) -> dict[str, str]:
     Raises:
         ValueError: this is not an ONNX file.
     """
-    found = {}
+    metadata = {}
     for number, value in _fields(memoryview(model)):
         if number == _MODEL_METADATA and isinstance(value, memoryview):
             entry = {key: bytes(text).decode() for key, text in _fields(value) if isinstance(text, memoryview)}
-            found[entry.get(_ENTRY_KEY, "")] = entry.get(_ENTRY_VALUE, "")
-    return found
+            metadata[entry.get(_ENTRY_KEY, "")] = entry.get(_ENTRY_VALUE, "")
+    return metadata
 
 
 def has_external_data(model: bytes) -> bool:
@@ -360,10 +360,10 @@ def _verify_graph(folder: Path, graph: GraphFile, stamped: dict[str, Any]) -> No
         content = path.read_bytes()
     except OSError as error:
         raise BundleError(f"{path}: {error.strerror}; make it readable, or copy the whole folder again") from None
-    found = _sha256(content)
-    if found != graph.sha256:
+    digest = _sha256(content)
+    if digest != graph.sha256:
         raise BundleError(
-            f"{path} is damaged or belongs to another bundle: its SHA-256 is {found[:12]}..., {MANIFEST} says"
+            f"{path} is damaged or belongs to another bundle: its SHA-256 is {digest[:12]}..., {MANIFEST} says"
             f" {graph.sha256[:12]}...; copy the whole folder again, or {EXPORT_AGAIN}"
         )
     try:

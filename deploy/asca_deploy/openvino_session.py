@@ -88,10 +88,10 @@ class OpenVinoSession:
         Raises:
             ProviderError: OpenVINO fails, for example for want of memory.
         """
-        found = [np.empty(shape, kind) for shape, kind in self._results]
+        results = [np.empty(shape, kind) for shape, kind in self._results]
         try:
             with self._lock:  # a request refuses a second caller, and one network keeps all cores busy
-                for port, array in enumerate(found):
+                for port, array in enumerate(results):
                     self._request.set_output_tensor(port, self._openvino.Tensor(array, shared_memory=True))
                 self._request.infer(dict(inputs), share_inputs=True)
         except RuntimeError as error:
@@ -99,7 +99,7 @@ class OpenVinoSession:
                 f"OpenVINO {self._version} failed while it ran {self._path}: {_last_line(error)}; "
                 "provider cpu may run it"
             ) from error
-        return [found[self._ports[name]] for name in outputs]
+        return [results[self._ports[name]] for name in outputs]
 
 
 def _last_line(error: RuntimeError) -> str:

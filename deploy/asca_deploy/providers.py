@@ -56,15 +56,15 @@ def require(provider: str, precision: str = "float32") -> None:
 
 def available() -> list[tuple[Provider, Precision]]:
     """Return every (provider, precision) that is installed; the faster precision of a provider first."""
-    found: list[tuple[Provider, Precision]] = []
+    ways: list[tuple[Provider, Precision]] = []
     for provider in PROVIDERS:
         for precision in reversed(PRECISIONS):
             try:
                 require(provider, precision)
             except ProviderError:
                 continue
-            found.append((provider, precision))
-    return found
+            ways.append((provider, precision))
+    return ways
 
 
 def open_session(

@@ -82,12 +82,12 @@ class ScanDetections(Detections):
         if points is None:
             points = self._points()
         points = np.empty((0, 4), np.float32) if points is None else np.asarray(points)
-        found = replace(self, boxes=self._level_boxes())
+        level = replace(self, boxes=self._level_boxes())
         if self.level is not None:
             points = self.level.points(points)
             labels = None if labels is None else self.level.boxes(labels)
         draw = draw_chase if view == "chase" else draw_layers
-        return draw(points, class_layers(found, labels), self.ranges, width_px=width_px).view(Picture)
+        return draw(points, class_layers(level, labels), self.ranges, width_px=width_px).view(Picture)
 
     def _points(self) -> NDArray[Any] | None:
         return None if self.source is None else self.source()
@@ -98,10 +98,10 @@ class ScanDetections(Detections):
     def _repr_html_(self) -> str:
         """Return a notebook's view: the picture if the points are still there, and the boxes as a table."""
         rows = "".join(
-            f"<tr><td>{html.escape(found.class_name)}</td><td>{found.score:.2f}</td><td>{found.x_m:.1f}</td>"
-            f"<td>{found.y_m:.1f}</td><td>{found.length_m:.1f} x {found.width_m:.1f} x {found.height_m:.1f}</td>"
-            f"<td>{np.rad2deg(found.yaw_rad):.0f}</td></tr>"
-            for found in self
+            f"<tr><td>{html.escape(box.class_name)}</td><td>{box.score:.2f}</td><td>{box.x_m:.1f}</td>"
+            f"<td>{box.y_m:.1f}</td><td>{box.length_m:.1f} x {box.width_m:.1f} x {box.height_m:.1f}</td>"
+            f"<td>{np.rad2deg(box.yaw_rad):.0f}</td></tr>"
+            for box in self
         )
         titles = ("class", "score", "x, m", "y, m", "l x w x h, m", "yaw, degrees")
         head = "".join(f"<th>{title}</th>" for title in titles)

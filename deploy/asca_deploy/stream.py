@@ -61,10 +61,10 @@ def overlap_stages(
         coming = ahead.start()
         while True:
             current, coming = coming, ahead.start()
-            found = current.result()
-            if not found:
+            outputs = current.result()
+            if not outputs:
                 return
-            yield finish(found[0])
+            yield finish(outputs[0])
 
 
 class _StageThreads(Generic[Scan, Ready, Maps]):

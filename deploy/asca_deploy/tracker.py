@@ -46,18 +46,18 @@ class Tracks:
         return len(self.detections)
 
     def __iter__(self) -> Iterator[Track]:
-        for number, found, (vx, vy) in zip(
+        for number, detection, (vx, vy) in zip(
             self.track_ids.tolist(), self.detections, self.velocities_mps.tolist(), strict=True
         ):
-            yield Track(number, found, vx, vy)
+            yield Track(number, detection, vx, vy)
 
     def to_dicts(self) -> list[dict[str, str | float]]:
         """Return `Detections.to_dicts` with `track_id`, `vx_mps` and `vy_mps` in each."""
         return [
-            found
+            detection
             | {"track_id": track.track_id, "vx_mps": round(track.vx_mps, _DIGITS)}
             | {"vy_mps": round(track.vy_mps, _DIGITS)}
-            for found, track in zip(self.detections.to_dicts(), self, strict=True)
+            for detection, track in zip(self.detections.to_dicts(), self, strict=True)
         ]
 
 
@@ -211,12 +211,12 @@ class Tracker:
             return np.full(len(boxes), UNMATCHED)
         squared = np.square(boxes[:, None, :2] - state.boxes[None, :, :2]).sum(axis=2)
         limit = GATE * (state.covariance[:, 0] + MEASURED_SIGMA_M**2)
-        found, known = np.nonzero((squared < limit) & (labels[:, None] == state.labels))
+        rows, known = np.nonzero((squared < limit) & (labels[:, None] == state.labels))
         affinity = np.zeros(squared.shape)
-        first, second = boxes[found], state.boxes[known]
+        first, second = boxes[rows], state.boxes[known]
         shared = paired_bev_intersection(first, second)
         iou = shared / (first[:, 3] * first[:, 4] + second[:, 3] * second[:, 4] - shared)
-        affinity[found, known] = iou + 1.0 - np.sqrt(squared[found, known] / limit[known])
+        affinity[rows, known] = iou + 1.0 - np.sqrt(squared[rows, known] / limit[known])
         holders = best_assignments(affinity)[-1]
         row_of = np.full(len(boxes), UNMATCHED)
         held = np.flatnonzero(holders != UNMATCHED)

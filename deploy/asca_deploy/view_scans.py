@@ -176,23 +176,23 @@ class _ScanContents:
         """Return the page's content for a scan; `save` is what `asca detect` writes of it."""
         with self._lock:
             scan = self._read(number)
-            found = self._detector(scan.points)
-        content = scan_content(self._paths[number], scan, found, self._scope)
+            detections = self._detector(scan.points)
+        content = scan_content(self._paths[number], scan, detections, self._scope)
         answer = {
-            "detections": _level_boxes(found),
-            "timesMs": found.report.times_ms,
+            "detections": _level_boxes(detections),
+            "timesMs": detections.report.times_ms,
             "remarks": content["warnings"],
             "save": content,
         }
         return _json(answer)
 
 
-def _level_boxes(found: ScanDetections) -> list[dict[str, Any]]:
+def _level_boxes(detections: ScanDetections) -> list[dict[str, Any]]:
     """Return class, score and box (7 numbers) of each detection, x forward, y left, z up, in the scan's order."""
-    boxes = found.boxes if found.level is None else found.level.boxes(found.boxes)
+    boxes = detections.boxes if detections.level is None else detections.level.boxes(detections.boxes)
     return [
         {"class": name, "score": float(score), "box": [float(value) for value in box]}
-        for name, score, box in zip(found.names, found.scores, boxes, strict=True)
+        for name, score, box in zip(detections.names, detections.scores, boxes, strict=True)
     ]
 
 
@@ -213,14 +213,14 @@ def _handler(answer: Callable[[str], tuple[str, bytes] | None]) -> type[BaseHTTP
                 self._send(HTTPStatus.FORBIDDEN, ".txt", b"asked for under another name")
                 return
             try:
-                found = answer(self.path)
+                content = answer(self.path)
             except (AscaError, OSError) as error:
                 self._send(HTTPStatus.UNPROCESSABLE_ENTITY, ".txt", printable(str(error)).encode())
                 return
-            if found is None:
+            if content is None:
                 self._send(HTTPStatus.NOT_FOUND, ".txt", b"there is no such file")
             else:
-                self._send(HTTPStatus.OK, *found)
+                self._send(HTTPStatus.OK, *content)
 
         def log_message(self, *_: Any) -> None:
             pass

@@ -157,10 +157,10 @@ def with_ranges(model: "ModelConfig", spec: DetectorSpec, range_m: tuple[float, 
     if not isinstance(spec, PillarSpec):
         raise ConfigError("--range: only detectors on pillars look elsewhere with the same weights; leave it out")
     x0, x1, y0, y1 = range_m
-    found = spec.with_ranges((x0, x1), (y0, y1))
+    widened = spec.with_ranges((x0, x1), (y0, y1))
     if isinstance(model, PillarModel) and model.network.cpa == "paper":  # its weights are laid out for so many pillars
-        return replace(found, limits=spec.limits)
-    return found
+        return replace(widened, limits=spec.limits)
+    return widened
 
 
 def read_or_simulate(

@@ -129,9 +129,9 @@ class RoundedMaps:
 
     def _parameters(self, eight_bit: Sequence[str]) -> dict[str, Tensor]:
         """Return the parameters by name: rounded ones of the layers in 8 bits, exact ones of the others."""
-        own = dict(self._rounded.named_parameters())
+        rounded = dict(self._rounded.named_parameters())
         return {
-            name: own[name] if name.rpartition(".")[0] in eight_bit else parameter
+            name: rounded[name] if name.rpartition(".")[0] in eight_bit else parameter
             for name, parameter in self._exact.named_parameters()
         }
 
@@ -262,11 +262,11 @@ class Sensitivity(NamedTuple):
     total: float
     """Error with all layers in 8 bits but `kept_float`."""
 
-    def report(self, own: "CalibrationScans", compared: int) -> Quantization:
+    def report(self, calibration: "CalibrationScans", compared: int) -> Quantization:
         """Return the entry of the manifest; boxes are not counted yet."""
         return Quantization(
-            calibration_scans=len(own.used),
-            dropped_scans=own.dropped,
+            calibration_scans=len(calibration.used),
+            dropped_scans=calibration.dropped,
             compared_scans=compared,
             layers=tuple(LayerQuantization(name, error, name in self.kept_float) for name, error in self.alone.items()),
             logit_rms_error=self.total,
@@ -295,9 +295,9 @@ def calibration_scans(
         ExportError: fewer than MIN_CALIBRATION.
     """
     digests = {_digest(points) for points in scans}
-    own = [points for points in calibration if _digest(points) not in digests]
-    dropped = len(calibration) - len(own)
-    used = [points for points in own if (spec.grid.cells(points) >= 0).any()]
+    other_scans = [points for points in calibration if _digest(points) not in digests]
+    dropped = len(calibration) - len(other_scans)
+    used = [points for points in other_scans if (spec.grid.cells(points) >= 0).any()]
     if len(used) < MIN_CALIBRATION:
         raise ExportError(
             f"{len(used)} scans with points on the grid given to calibrate on, at least {MIN_CALIBRATION} are "
@@ -327,11 +327,11 @@ def quantize_bundle(
     Raises:
         ExportError: too few scans, or MAX_LOGIT_ERROR is exceeded whatever stays in floating point.
     """
-    own = calibration_scans(calibration, scans, bundle.spec)
+    chosen_scans = calibration_scans(calibration, scans, bundle.spec)
     runtime = Detector(folder)
     pipeline = runtime.pipeline
     assert isinstance(pipeline, PillarPipeline), "the bundle has just been exported from a pillar detector"
-    encoded = [_encode(pipeline, points) for points in own.used]
+    encoded = [_encode(pipeline, points) for points in chosen_scans.used]
     steps = canvas_steps(each.features for each in encoded)
     form = CanvasFormat("uint8", tuple(int(step) for step in steps.empty))
     eight_bit_form = replace(bundle, pillar=replace(bundle.pillar, canvas=form))
@@ -347,14 +347,14 @@ def quantize_bundle(
             rounded.write(trial, eight_bit)
             backbone = open_backbone(trial, eight_bit_form, "cpu", "float32", runtime.threads)
             placed = (backbone.place(each.quantize_features(steps), each.pillars.cells) for each in compared)
-            found = (backbone.run(each).maps.scores for each in placed)
-            return logit_error(expected, found, bundle.spec)
+            actual = (backbone.run(each).maps.scores for each in placed)
+            return logit_error(expected, actual, bundle.spec)
 
-        found = sweep(rounded.layers, error_of, progress)
-        eight_bit = [layer for layer in rounded.layers if layer not in found.kept_float]
+        sweep_result = sweep(rounded.layers, error_of, progress)
+        eight_bit = [layer for layer in rounded.layers if layer not in sweep_result.kept_float]
         rounded.write(graphs.graph_path(folder, BACKBONE), eight_bit)
     quantize_encoder(graphs.graph_path(folder, ENCODER), steps)
-    return write_quantized(folder, eight_bit_form, found.report(own, len(scans)), boxes, scans)
+    return write_quantized(folder, eight_bit_form, sweep_result.report(chosen_scans, len(scans)), boxes, scans)
 
 
 def write_quantized(
@@ -409,10 +409,10 @@ def sweep(
     return Sensitivity(alone, kept, total)
 
 
-def _with_boxes(report: Quantization, expected: Sequence[Detections], found: Sequence[Detections]) -> Quantization:
+def _with_boxes(report: Quantization, expected: Sequence[Detections], actual: Sequence[Detections]) -> Quantization:
     """Return the report with the boxes that the 8-bit bundle finds again, and those that it alone finds."""
-    matched = sum(map(_count_matches, expected, found))
-    added = sum(map(len, found)) - sum(map(_count_matches, found, expected))
+    matched = sum(map(_count_matches, expected, actual))
+    added = sum(map(len, actual)) - sum(map(_count_matches, actual, expected))
     return replace(report, boxes_matched=matched, boxes_added=added)
 
 
@@ -426,15 +426,15 @@ def _encode(pipeline: PillarPipeline, points: Points) -> EncodedScan:
 
 
 def logit_error(
-    expected: Sequence[NDArray[np.float32]], found: Iterator[NDArray[np.float32]], spec: PillarSpec | VoxelSpec
+    expected: Sequence[NDArray[np.float32]], actual: Iterator[NDArray[np.float32]], spec: PillarSpec | VoxelSpec
 ) -> float:
     """Return the RMS difference of the class logits, at the COMPARED_ANCHORS best anchors of each class and scan."""
     squares = []
-    for reference, got in zip(expected, found, strict=True):
-        for ours, theirs in zip(by_class(reference, spec), by_class(got, spec), strict=True):
-            if len(ours):
-                best = np.argpartition(-ours, min(COMPARED_ANCHORS, ours.size - 1))[:COMPARED_ANCHORS]
-                squares.append(np.square(ours[best] - theirs[best]).mean())
+    for reference, got in zip(expected, actual, strict=True):
+        for exact, rounded in zip(by_class(reference, spec), by_class(got, spec), strict=True):
+            if len(exact):
+                best = np.argpartition(-exact, min(COMPARED_ANCHORS, exact.size - 1))[:COMPARED_ANCHORS]
+                squares.append(np.square(exact[best] - rounded[best]).mean())
     return float(np.sqrt(np.mean(squares)))
 
 

@@ -71,8 +71,8 @@ def check_parity(detector: PillarDetector, runtime: PillarPipeline, scans: Seque
         maps, cells = runtime.backbone.run(placed)
         if cells is None and batch.neck is not None:  # a sparse neck as dense convolutions
             maps, cells = _at_cells(maps, batch.neck.head_cells.numpy(), number)
-        for name, expected, found in zip(HeadMaps._fields, expected_maps, maps, strict=True):
-            error = require_close(f"head `{name}`", expected, found, MAP_TOLERANCE, number)
+        for name, expected, actual in zip(HeadMaps._fields, expected_maps, maps, strict=True):
+            error = require_close(f"head `{name}`", expected, actual, MAP_TOLERANCE, number)
             worst_map = max(worst_map, error)
         boxes = compare_boxes(expected_maps, maps, spec, number, cells)
         worst_box, worst_yaw = max(worst_box, boxes.center_size_m), max(worst_yaw, boxes.yaw_rad)
@@ -109,10 +109,10 @@ def by_class(scores: NDArray[np.float32], spec: PillarSpec | VoxelSpec) -> NDArr
 
 
 def require_close(
-    stage: str, expected: NDArray[np.float32], found: NDArray[np.float32], allowed: float, scan: int
+    stage: str, expected: NDArray[np.float32], actual: NDArray[np.float32], allowed: float, scan: int
 ) -> float:
     """Return the largest difference; ExportError if it exceeds `allowed`."""
-    error = float(np.abs(expected - found).max(initial=0.0))
+    error = float(np.abs(expected - actual).max(initial=0.0))
     if not error <= allowed:
         raise _parity_error(
             scan,
@@ -131,7 +131,7 @@ def _parity_error(scan: int, difference: str) -> ExportError:
 def require_same_refined(
     proposals: Detections,
     expected: tuple[NDArray[np.float32], NDArray[np.float32]],
-    found: tuple[NDArray[np.float32], NDArray[np.float32]],
+    actual: tuple[NDArray[np.float32], NDArray[np.float32]],
     spec: DetectorSpec,
     scores: Scores,
     scan: int,
@@ -140,7 +140,7 @@ def require_same_refined(
 
     Args:
         proposals: R of them.
-        expected, found: logits (R,) and residuals (R, 7), of PyTorch and of the graph.
+        expected, actual: logits (R,) and residuals (R, 7), of PyTorch and of the graph.
         spec: of both detectors.
         scores: what a box is scored by.
         scan: its number, for messages.
@@ -150,7 +150,7 @@ def require_same_refined(
     """
     spec = spec.with_score_threshold(0.0)
     spec = replace(spec, post=replace(spec.post, nms_iou=1.0, max_detections=max(len(proposals), 1)))
-    boxes, partners = (reported_detections(proposals, *answer, spec, scores) for answer in (expected, found))
+    boxes, partners = (reported_detections(proposals, *answer, spec, scores) for answer in (expected, actual))
     difference, lone = match_nearest(boxes, partners)
     if len(lone):
         raise _parity_error(
@@ -162,7 +162,7 @@ def require_same_refined(
 
 
 def compare_boxes(
-    expected: Maps, found: Maps, spec: PillarSpec, scan: int = 0, cells: NDArray[np.int32] | None = None
+    expected: Maps, actual: Maps, spec: PillarSpec, scan: int = 0, cells: NDArray[np.int32] | None = None
 ) -> LargestDifferences:
     """Decode both maps and pair the boxes, before and after suppression; every box needs a partner.
 
@@ -171,7 +171,7 @@ def compare_boxes(
     No box votes: all that could have been compared, and whether one has a vote can hang on a rounding.
 
     Args:
-        expected, found: maps, or rows of the same head cells.
+        expected, actual: maps, or rows of the same head cells.
         spec: of both detectors.
         scan: its number, for messages.
         cells: (M,) the head cells of rows, see `decode`.
@@ -187,10 +187,10 @@ def compare_boxes(
     worst = LargestDifferences(0.0, 0.0)
     for post in (replace(uncut, nms_iou=1.0), uncut):
         lowered = replace(spec, classes=classes, post=post)
-        ours, theirs = lowered.decode(expected, cells), lowered.decode(found, cells)
-        forward, our_lone = match_nearest(ours, theirs)
-        backward, their_lone = match_nearest(theirs, ours)
-        _require_score_ties(ours[our_lone], theirs[their_lone], ours, theirs, lowered, scan)
+        in_torch, exported = lowered.decode(expected, cells), lowered.decode(actual, cells)
+        forward, our_lone = match_nearest(in_torch, exported)
+        backward, their_lone = match_nearest(exported, in_torch)
+        _require_score_ties(in_torch[our_lone], exported[their_lone], in_torch, exported, lowered, scan)
         worst = LargestDifferences(*map(max, zip(worst, forward, backward, strict=True)))
     return worst
 
@@ -221,7 +221,7 @@ def match_nearest(boxes: Detections, partners: Detections) -> tuple[LargestDiffe
 
 
 def _require_score_ties(
-    our_lone: Detections, their_lone: Detections, ours: Detections, theirs: Detections, spec: PillarSpec, scan: int
+    our_lone: Detections, their_lone: Detections, expected: Detections, actual: Detections, spec: PillarSpec, scan: int
 ) -> None:
     """Raise ExportError unless ties between scores explain every box that one side alone has.
 
@@ -229,7 +229,7 @@ def _require_score_ties(
     overlap with one is as large as suppression allows, within rounding; and if it overlaps an explained box of the
     other side, which suppression then put in its place or took out of its way.
     """
-    explained = [_are_score_ties(our_lone, theirs, spec), _are_score_ties(their_lone, ours, spec)]
+    explained = [_are_score_ties(our_lone, actual, spec), _are_score_ties(their_lone, expected, spec)]
     clash = _excess_overlap(our_lone, their_lone, spec) > 0
     while True:
         grown = [explained[0] | clash[:, explained[1]].any(axis=1), explained[1] | clash[explained[0]].any(axis=0)]

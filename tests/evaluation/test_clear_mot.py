@@ -32,5 +32,5 @@ def test_what_is_not_counted_takes_its_box_away() -> None:
     boxes = np.array([[5, 0, 0, 4, 2, 1.5, 0], [20, 0, 0, 4, 2, 1.5, 0]], np.float32)
     extra = np.concatenate([boxes, boxes[:1] + np.array([0, 30, 0, 0, 0, 0, 0], np.float32)])
     left = tracked_frame(Boxes(boxes, np.array([1, 2])), np.array([True, False]), Boxes(extra, np.array([7, 8, 9])))
-    assert left.objects.tolist() == [1] and left.found.tolist() == [7, 9]
+    assert left.objects.tolist() == [1] and left.detections.tolist() == [7, 9]
     assert left.similarity[0].tolist() == [1.0, 0.0]

@@ -13,12 +13,14 @@ from tests.evaluation.tracked_frames import frame
 
 def twin(frames: list[TrackedFrame]) -> list[float]:
     """HOTA at every threshold: all one-to-one matchings of each frame, all sets of pairs."""
-    labels, found = ([int(i) for f in frames for i in side(f)] for side in (lambda f: f.objects, lambda f: f.found))
+    labels, found = (
+        [int(i) for f in frames for i in side(f)] for side in (lambda f: f.objects, lambda f: f.detections)
+    )
     values = []
     for alpha in ALPHAS:
         could = [f.similarity >= alpha - 1e-9 for f in frames]
         near = [(f, i, j) for f, own in zip(frames, could, strict=True) for i, j in np.argwhere(own)]
-        everywhere = [(int(f.objects[i]), int(f.found[j])) for f, i, j in near]
+        everywhere = [(int(f.objects[i]), int(f.detections[j])) for f, i, j in near]
 
         def association(pair: tuple[int, int], pairs: list[tuple[int, int]]) -> float:
             tpa = pairs.count(pair)
@@ -30,7 +32,7 @@ def twin(frames: list[TrackedFrame]) -> list[float]:
             best: tuple[tuple[float, ...], list[tuple[int, int]]] = ((-1.0,), [])
             for way in permutations(range(m + n), n):  # columns from m on stand for no match
                 places = [(row, column) for row, column in enumerate(way) if column < m and own[row, column]]
-                pairs = [(int(f.objects[row]), int(f.found[column])) for row, column in places]
+                pairs = [(int(f.objects[row]), int(f.detections[column])) for row, column in places]
                 close = sum(association(pair, everywhere) for pair in pairs)
                 close += 1e-3 * sum(f.similarity[place] for place in places)
                 best = max(best, ((float(len(pairs)), close), pairs), key=lambda one: one[0])
@@ -67,5 +69,5 @@ def test_against_the_twin(seed: int) -> None:
         found = 10 + rng.permutation(3)[: rng.integers(0, 4)]
         # Distinct values, so that the best matching is one.
         frames.append(frame(objects.tolist(), found.tolist(), rng.random((len(objects), len(found)))))
-    if sum(len(f.objects) + len(f.found) for f in frames):
+    if sum(len(f.objects) + len(f.detections) for f in frames):
         assert hota([frames]).hota == pytest.approx(np.mean(twin(frames)), abs=1e-9)

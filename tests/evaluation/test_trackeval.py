@@ -60,14 +60,14 @@ def test_fragmentations_differ_as_documented() -> None:
 
 def trackeval_data(frames: Sequence[TrackedFrame]) -> dict[str, object]:
     objects = np.unique(np.concatenate([frame.objects for frame in frames]))
-    found = np.unique(np.concatenate([frame.found for frame in frames]))
+    found = np.unique(np.concatenate([frame.detections for frame in frames]))
     return {
         "num_timesteps": len(frames),
         "num_gt_ids": len(objects),
         "num_tracker_ids": len(found),
         "num_gt_dets": sum(len(frame.objects) for frame in frames),
-        "num_tracker_dets": sum(len(frame.found) for frame in frames),
+        "num_tracker_dets": sum(len(frame.detections) for frame in frames),
         "gt_ids": [np.searchsorted(objects, frame.objects) for frame in frames],
-        "tracker_ids": [np.searchsorted(found, frame.found) for frame in frames],
+        "tracker_ids": [np.searchsorted(found, frame.detections) for frame in frames],
         "similarity_scores": [frame.similarity for frame in frames],
     }

@@ -212,10 +212,10 @@ def rename_types(imported: Imported, names: Mapping[str, str]) -> Imported:
         names = {old: text_of(new, "the new name") for old, new in names.items()}
     except ValueError as reason:
         raise ConfigError(f"--rename: {reason}; give a name of one line") from None
-    there = {kind for frame in imported.frames for kind in frame.records.types}
-    if unknown := sorted(set(names) - there):
+    types = {kind for frame in imported.frames for kind in frame.records.types}
+    if unknown := sorted(set(names) - types):
         raise ConfigError(
-            f"--rename {unknown[0]}: no box has that class; there are {', '.join(sorted(there)) or 'none'}"
+            f"--rename {unknown[0]}: no box has that class; there are {', '.join(sorted(types)) or 'none'}"
         )
     frames = [
         frame._replace(
@@ -279,8 +279,8 @@ def write_imported(out: Path, imported: Imported, val_share: float) -> ImportCou
             if read.pop(frame_id_of(frame.scan, scans)).records.types != frame.records.types:
                 raise DatasetError(f"{frame.scan}: its boxes cannot be read again; report this")
     train, val = _lists(frames, val_share)
-    for name, own in (("train", train), ("val", val)):
-        write_image_set(out, name, (frame_id_of(frame.scan, scans) for frame in own))
+    for name, part in (("train", train), ("val", val)):
+        write_image_set(out, name, (frame_id_of(frame.scan, scans) for frame in part))
     write_text(out / DATASET_FILE, MARKER + settings)
     boxes = Counter(kind for frame in frames for kind in frame.records.types)
     doubt = check_yaws([frame.records.boxes[:, 6] for frame in frames])

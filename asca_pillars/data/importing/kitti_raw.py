@@ -53,9 +53,11 @@ def _frames(drive: Path, left_out: SkippedEntries) -> list[ImportedFrame]:
     labels = _read_tracklets(drive / LABELS, left_out)
     frames = []
     for scan in visible_files(drive / "velodyne_points" / "data", "*.bin"):
-        own = labels.get(int(scan.stem) if scan.stem.isdecimal() else -1, _Labels([], [], []))
-        boxes = np.array(own.boxes, np.float64).reshape(-1, 7)
-        frames.append(ImportedFrame(scan, records_from(boxes, own.types, None, own.tracks), drive.name))
+        frame_labels = labels.get(int(scan.stem) if scan.stem.isdecimal() else -1, _Labels([], [], []))
+        boxes = np.array(frame_labels.boxes, np.float64).reshape(-1, 7)
+        frames.append(
+            ImportedFrame(scan, records_from(boxes, frame_labels.types, None, frame_labels.tracks), drive.name)
+        )
     return frames
 
 
@@ -94,10 +96,10 @@ def _add(
         except ValueError as reason:
             left_out.add("boxes", f"{path}, tracklet {number}, pose {offset}", reason)
             continue
-        own = labels[first + offset]
-        own.boxes.append([x, y, bottom + height / 2, length, width, height, yaw])
-        own.types.append(TYPES.get(kind, kind))
-        own.tracks.append(str(number))
+        frame_labels = labels[first + offset]
+        frame_labels.boxes.append([x, y, bottom + height / 2, length, width, height, yaw])
+        frame_labels.types.append(TYPES.get(kind, kind))
+        frame_labels.tracks.append(str(number))
 
 
 def _numbers(element: ElementTree.Element, names: Sequence[str]) -> list[float]:

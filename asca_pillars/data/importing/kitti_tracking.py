@@ -53,15 +53,17 @@ def _frames(folder: Path, labels: Path, left_out: SkippedEntries) -> list[Import
     frames = []
     for scan in visible_files(folder / "velodyne" / sequence, "*.bin"):
         number = int(scan.stem) if scan.stem.isdecimal() else -1
-        own = [(item, track) for item, track in tracked.get(number, []) if item.has_box_3d]
-        frames.append(ImportedFrame(scan, _records(own, calibration), sequence))
+        objects = [(item, track) for item, track in tracked.get(number, []) if item.has_box_3d]
+        frames.append(ImportedFrame(scan, _records(objects, calibration), sequence))
     return frames
 
 
-def _records(own: list[_Tracked], calibration: Calibration) -> BoxRecords:
-    objects = [item for item, _ in own]
+def _records(tracked: list[_Tracked], calibration: Calibration) -> BoxRecords:
+    objects = [item for item, _ in tracked]
     boxes = boxes_from_objects(objects, calibration)
-    return records_from(boxes, [TYPES.get(item.type, item.type) for item in objects], None, [track for _, track in own])
+    return records_from(
+        boxes, [TYPES.get(item.type, item.type) for item in objects], None, [track for _, track in tracked]
+    )
 
 
 def _read_tracked(path: Path, left_out: SkippedEntries) -> dict[int, list[_Tracked]]:

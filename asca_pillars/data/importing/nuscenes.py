@@ -103,8 +103,8 @@ def _frames(
                     continue  # only a part of the dataset may have been downloaded
                 raise ValueError(f"filename is {str(filename)[:80]!r}, no file below {data}")
             changes = [_change(frame) for frame in (_linked(row, "ego_pose", tables), sensor)]
-            own = labels.get(row["sample_token"], [])
-            frames.append(ImportedFrame(scan, _records(own, changes, tables, folder, left_out), scene))
+            annotations = labels.get(row["sample_token"], [])
+            frames.append(ImportedFrame(scan, _records(annotations, changes, tables, folder, left_out), scene))
         except ValueError as reason:
             left_out.add("frames", f"{folder}/sample_data.json, {token}", reason)
     return frames
@@ -159,11 +159,11 @@ def _linked(row: _Row, name: str, tables: Mapping[str, _Table]) -> _Row:
 def _tables_folder(root: Path) -> Path:
     if (root / "sample_data.json").is_file():
         return root
-    found = sorted(path.parent for path in root.glob("v1.0-*/sample_data.json"))
-    if len(found) != 1:
-        there = ", ".join(path.name for path in found) or "none"
-        raise DatasetError(f"{root}: one v1.0-*/ with nuScenes' tables is needed, there is {there}; give its path")
-    return found[0]
+    folders = sorted(path.parent for path in root.glob("v1.0-*/sample_data.json"))
+    if len(folders) != 1:
+        names = ", ".join(path.name for path in folders) or "none"
+        raise DatasetError(f"{root}: one v1.0-*/ with nuScenes' tables is needed, there is {names}; give its path")
+    return folders[0]
 
 
 def _table(folder: Path, name: str, left_out: SkippedEntries) -> _Table:

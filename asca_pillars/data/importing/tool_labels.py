@@ -263,8 +263,8 @@ def _scans_by_name(scans: Path) -> Callable[[Path, Path], Path]:
             label_place = place(relative.parent)
             candidates = [scan for scan in candidates if place(scan.parent.relative_to(scans)) == label_place]
         if len(candidates) != 1:
-            found = " and ".join(map(str, candidates[:2])) or "none"
-            raise DatasetError(f"{path}: belongs to one scan {stem}.* below {scans}, there is {found}; correct --scans")
+            names = " and ".join(map(str, candidates[:2])) or "none"
+            raise DatasetError(f"{path}: belongs to one scan {stem}.* below {scans}, there is {names}; correct --scans")
         return candidates[0]
 
     return scan_of

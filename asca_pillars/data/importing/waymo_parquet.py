@@ -100,8 +100,8 @@ def range_image_points(
         world = np.einsum("nij,nj->ni", rotations_from_roll_pitch_yaw(poses[:, :3]), points) + poses[:, 3:]
         points = (world - world_from_vehicle[:3, 3]) @ world_from_vehicle[:3, :3]
     reflectance = np.tanh(np.maximum(image[rows, columns, 1], 0))
-    found = np.column_stack([points, reflectance])
-    return found[(np.abs(found) < np.finfo(np.float32).max).all(axis=1)].astype(np.float32)
+    cloud = np.column_stack([points, reflectance])
+    return cloud[(np.abs(cloud) < np.finfo(np.float32).max).all(axis=1)].astype(np.float32)
 
 
 TOP = 1
@@ -241,20 +241,20 @@ def _labels(path: Path, left_out: SkippedEntries) -> dict[int, BoxRecords]:
         boxes[time].append(box)
         types[time].append(TYPES.get(kind, "Unknown"))
         objects[time].append(identity)
-    return {time: records_from(np.array(own), types[time], None, objects[time]) for time, own in boxes.items()}
+    return {time: records_from(np.array(rows), types[time], None, objects[time]) for time, rows in boxes.items()}
 
 
 def _calibrations(path: Path, left_out: SkippedEntries) -> dict[int, LidarCalibration]:
     """Read the calibration of each sensor, by its number."""
     columns = (_LASER, _EXTRINSIC, *(f"{_INCLINATION}.{part}" for part in ("values", "min", "max")))
-    found = {}
+    calibrations = {}
     for number, row in enumerate(_parquet_rows(path, columns)):
         try:
             stated = row[f"{_INCLINATION}.values"]
             given = isinstance(stated, np.ndarray) and len(stated) > 0
             ends = [row[f"{_INCLINATION}.{end}"] for end in ("min", "max")]
             lowest, highest = (0.0, 0.0) if given else numbers(ends, 2, "the inclination's ends").tolist()
-            found[whole_number(row[_LASER], _LASER)] = LidarCalibration(
+            calibrations[whole_number(row[_LASER], _LASER)] = LidarCalibration(
                 _rigid(row[_EXTRINSIC], _EXTRINSIC),
                 numbers(stated, None, "the inclinations") if given else None,
                 lowest,
@@ -262,7 +262,7 @@ def _calibrations(path: Path, left_out: SkippedEntries) -> dict[int, LidarCalibr
             )
         except ValueError as reason:
             left_out.add("calibrations", f"{path}, row {number}", reason)
-    return found
+    return calibrations
 
 
 def _rigid(values: Any, name: str) -> Doubles:

@@ -146,9 +146,9 @@ def _interpolate(lattice: NDArray[Any], origin_m: Floating, step_m: float, xy_m:
     place = np.clip((xy - origin_m[:, None]) / step_m - 0.5, 0, [[rows - 1], [columns - 1]])
     (i, j), (s, t) = place.astype(np.int64), place % 1
     values = (lattice if len(xy_m) < lattice.size else lattice.astype(np.float64)).ravel()
-    here, below, right = i * columns + j, np.where(i < rows - 1, columns, 0), np.where(j < columns - 1, 1, 0)
-    near = values[here] * (1 - t) + values[here + right] * t
-    far = values[here + below] * (1 - t) + values[here + below + right] * t
+    corner, below, right = i * columns + j, np.where(i < rows - 1, columns, 0), np.where(j < columns - 1, 1, 0)
+    near = values[corner] * (1 - t) + values[corner + right] * t
+    far = values[corner + below] * (1 - t) + values[corner + below + right] * t
     return np.asarray(near * (1 - s) + far * s)
 
 

@@ -278,10 +278,10 @@ def prepare_inserter(
     )
     counted = (database.point_counts >= data.min_points) & spec.ranges.hold_centers(database.boxes)
     counts = np.bincount(database.labels[counted], minlength=len(spec.class_names))
-    wanted = np.array([insert.proportions.get(name, 0.0) for name in spec.class_names])
+    proportions = np.array([insert.proportions.get(name, 0.0) for name in spec.class_names])
     if not insert.proportions:
-        wanted[:] = 1.0
-    shares = insertion_shares(counts / len(split.frame_ids), wanted, insert.objects)
+        proportions[:] = 1.0
+    shares = insertion_shares(counts / len(split.frame_ids), proportions, insert.objects)
     inserter = Inserter(
         split, insert, spec.ranges, camera_view, data.min_points, prepared, database, tuple(shares.tolist())
     )
@@ -308,29 +308,31 @@ def _nothing_to_insert(split: LabeledSplit, name: str, min_points: int, objects:
     )
 
 
-def insertion_shares(per_frame: NDArray[np.float64], wanted: NDArray[np.float64], objects: int) -> NDArray[np.float64]:
-    """Return each class's probability (C,) of insertion, by which the total counts have the wanted proportions.
+def insertion_shares(
+    per_frame: NDArray[np.float64], proportions: NDArray[np.float64], objects: int
+) -> NDArray[np.float64]:
+    """Return each class's probability (C,) of insertion, by which the total counts have these proportions (C,).
 
     A class that has more than its part already gets none; the others are filled up to one level, in units of
-    the wanted proportions: sum over classes of max(0, level * wanted - per_frame) = objects.
+    the proportions: sum over classes of max(0, level * proportions - per_frame) = objects.
 
     Args:
         per_frame: (C,) mean number of objects in a frame.
-        wanted: (C,) proportions, not all 0; a class with 0 is not inserted.
+        proportions: (C,) proportions, not all 0; a class with 0 is not inserted.
         objects: number inserted into each frame.
     """
-    shares = np.zeros(len(wanted))
-    classes = np.flatnonzero(wanted > 0)
+    shares = np.zeros(len(proportions))
+    classes = np.flatnonzero(proportions > 0)
     if objects == 0:
-        shares[classes] = wanted[classes] / wanted.sum()
+        shares[classes] = proportions[classes] / proportions.sum()
         return shares
-    order = classes[np.argsort(per_frame[classes] / wanted[classes])]
+    order = classes[np.argsort(per_frame[classes] / proportions[classes])]
     for number in range(1, len(order) + 1):
         filled = order[:number]
-        level = (objects + per_frame[filled].sum()) / wanted[filled].sum()
-        if number == len(order) or level <= per_frame[order[number]] / wanted[order[number]]:
+        level = (objects + per_frame[filled].sum()) / proportions[filled].sum()
+        if number == len(order) or level <= per_frame[order[number]] / proportions[order[number]]:
             break
-    shares[filled] = (level * wanted[filled] - per_frame[filled]) / objects
+    shares[filled] = (level * proportions[filled] - per_frame[filled]) / objects
     return shares
 
 

@@ -99,7 +99,7 @@ def _no_objects_reason(facts: ClassFacts, inspection: Inspection, spec: Inspecte
 def _why_no_boxes(name: str, inspection: Inspection) -> str:
     if (other := other_spelling(name, inspection.types)) is not None:
         return f"the labels spell it '{other}'; rename it there or in model.spec.classes"
-    there = ", ".join(f"{kind} {count}" for kind, count in inspection.types.items()) or "none at all"
+    listed = ", ".join(f"{kind} {count}" for kind, count in inspection.types.items()) or "none at all"
     if inspection.sampled:
         advice = f"look at all frames with --frames {inspection.frames_in_split}, or list other frames in ImageSets/"
     else:
@@ -107,7 +107,7 @@ def _why_no_boxes(name: str, inspection: Inspection) -> str:
             "list frames that have some in ImageSets/, take the class out of model.spec.classes, or let --propose "
             "measure the classes that there are"
         )
-    return f"no label is of this type (there are: {there}); {advice}"
+    return f"no label is of this type (there are: {listed}); {advice}"
 
 
 def _class_findings(facts: ClassFacts, spec: InspectedSpec, min_points: int) -> Iterator[str]:
@@ -316,9 +316,9 @@ def propose(split: LabeledSplit, config: Config, *, frames: int = 500, reporter:
     counts = {kind: len(boxes) for kind, boxes in sorted(boxes_of.items(), key=lambda item: -len(item[1]))}
     names = [kind for kind, count in counts.items() if count >= FEWEST_BOXES]
     if not names:
-        there = ", ".join(f"{kind} {count}" for kind, count in counts.items()) or "none"
+        listed = ", ".join(f"{kind} {count}" for kind, count in counts.items()) or "none"
         raise DatasetError(
-            f"{split.root}: no type has {FEWEST_BOXES} boxes with points (there are: {there}); add frames"
+            f"{split.root}: no type has {FEWEST_BOXES} boxes with points (there are: {listed}); add frames"
         )
     measured = {kind: np.array(boxes_of[kind], np.float64) for kind in names}
     of_classes = [np.array(findable[kind] or boxes_of[kind], np.float64) for kind in names]

@@ -224,9 +224,9 @@ def read_image_set(root: Path, name: str) -> set[str]:
     except UnicodeDecodeError:
         raise DatasetError(f"{path}: not UTF-8 text; write one frame id per line") from None
     except OSError as error:
-        there = ", ".join(p.stem for p in visible_files(path.parent, "*.txt")) or "none"
+        names = ", ".join(p.stem for p in visible_files(path.parent, "*.txt")) or "none"
         raise DatasetError(
-            f"{path}: no such split (lists there: {there}); write the list, one frame id per line (KITTI's own: asca "
+            f"{path}: no such split (lists there: {names}); write the list, one frame id per line (KITTI's own: asca "
             "prepare --kitti-split), or take every frame: --split training; in a configuration data.train_set and "
             "data.val_set = training"
         ) from error

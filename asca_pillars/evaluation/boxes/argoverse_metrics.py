@@ -69,11 +69,11 @@ def _similarity(boxes: Floats, objects: Floats) -> Floats:
 
 
 def _in_range(frame: EvaluatedFrame) -> EvaluatedFrame:
-    near = np.linalg.norm(frame.found[:, :3], axis=1) < MAX_RANGE_M
+    near = np.linalg.norm(frame.detections[:, :3], axis=1) < MAX_RANGE_M
     visible = frame.visible & (np.linalg.norm(frame.objects[:, :3], axis=1) < MAX_RANGE_M)
-    types = [kind for kind, kept in zip(frame.found_types, near, strict=True) if kept]
-    found, scores = frame.found[near], frame.scores[near]
-    return EvaluatedFrame(frame.frame_id, frame.objects, frame.object_types, visible, found, types, scores)
+    types = [kind for kind, kept in zip(frame.detection_types, near, strict=True) if kept]
+    detections, scores = frame.detections[near], frame.scores[near]
+    return EvaluatedFrame(frame.frame_id, frame.objects, frame.object_types, visible, detections, types, scores)
 
 
 def _score(pairs: BoxPairs, name: str) -> ArgoverseScore:
@@ -85,9 +85,9 @@ def _score(pairs: BoxPairs, name: str) -> ArgoverseScore:
     true = kept & (distance_m < ERROR_DISTANCE_M)
     errors = _WORST
     if true.any():
-        found, own = pairs.found[true], pairs.objects[owner[true]]
-        turned = np.abs(wrap_angle(found[:, 6] - own[:, 6]))
-        errors = np.array([distance_m[true].mean(), aligned_size_error(found, own).mean(), turned.mean()])
+        detections, matched = pairs.detections[true], pairs.objects[owner[true]]
+        turned = np.abs(wrap_angle(detections[:, 6] - matched[:, 6]))
+        errors = np.array([distance_m[true].mean(), aligned_size_error(detections, matched).mean(), turned.mean()])
     cds = ap * float(np.mean(1 - errors / _WORST))
     ate_m, ase, aoe_rad = errors.tolist()
     return ArgoverseScore(name, objects, 100 * ap, ate_m, ase, aoe_rad, 100 * cds)

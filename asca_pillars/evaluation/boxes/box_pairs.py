@@ -25,8 +25,8 @@ class EvaluatedFrame:
         objects: (M, 7) labelled boxes.
         object_types: class of each.
         visible: (M,) whether an object contains a point; one without is neither missed nor makes a detection false.
-        found: (N, 7) detected boxes.
-        found_types: class of each.
+        detections: (N, 7) detected boxes.
+        detection_types: class of each.
         scores: (N,).
     """
 
@@ -34,8 +34,8 @@ class EvaluatedFrame:
     objects: NDArray[np.floating]
     object_types: Sequence[str]
     visible: Mask
-    found: NDArray[np.floating]
-    found_types: Sequence[str]
+    detections: NDArray[np.floating]
+    detection_types: Sequence[str]
     scores: NDArray[np.floating]
 
 
@@ -45,7 +45,7 @@ class BoxPairs:
 
     Attributes:
         scores: (N,).
-        found: (N, 7).
+        detections: (N, 7).
         frames: (N,) number of each detection's frame.
         objects: (K, 7).
         first: (N,) the first object of the detection's frame, and
@@ -54,7 +54,7 @@ class BoxPairs:
     """
 
     scores: Floats
-    found: Floats
+    detections: Floats
     frames: Ints
     objects: Floats
     first: Ints
@@ -81,17 +81,17 @@ def pair_class(frames: Sequence[EvaluatedFrame], class_name: str, similarity: Si
 
     Objects without a point, and those of a neighboring type (KITTI's Van for Car), are not counted.
     """
-    found, scores, numbers, objects, first, rows, ignored_similarity = [], [], [], [], [], [], []
+    detections, scores, numbers, objects, first, rows, ignored_similarity = [], [], [], [], [], [], []
     start = 0
     for number, frame in enumerate(frames):
         types = np.array(frame.object_types, dtype=object)
-        own = types == class_name
-        counted = own & frame.visible
-        spare = (own & ~frame.visible) | (types == NEIGHBOR_TYPES.get(class_name, ""))
-        detected = np.array(frame.found_types, dtype=object) == class_name
-        boxes = np.asarray(frame.found, np.float64)[detected]
+        of_class = types == class_name
+        counted = of_class & frame.visible
+        spare = (of_class & ~frame.visible) | (types == NEIGHBOR_TYPES.get(class_name, ""))
+        detected = np.array(frame.detection_types, dtype=object) == class_name
+        boxes = np.asarray(frame.detections, np.float64)[detected]
         truth = np.asarray(frame.objects, np.float64)
-        found.append(boxes)
+        detections.append(boxes)
         scores.append(np.asarray(frame.scores, np.float64)[detected])
         numbers.append(np.full(len(boxes), number))
         objects.append(truth[counted])
@@ -103,7 +103,7 @@ def pair_class(frames: Sequence[EvaluatedFrame], class_name: str, similarity: Si
     order = np.argsort(-score, kind="stable")
     return BoxPairs(
         score[order],
-        np.concatenate([*found, np.zeros((0, 7))])[order],
+        np.concatenate([*detections, np.zeros((0, 7))])[order],
         np.concatenate([*numbers, np.zeros(0, np.int64)])[order],
         np.concatenate([*objects, np.zeros((0, 7))]),
         np.concatenate([*first, np.zeros(0, np.int64)])[order],
@@ -150,7 +150,7 @@ def in_band(pairs: BoxPairs, matched: Ints, band: str) -> tuple[Mask, Mask, int]
 
     A matched detection is in the band of its object; only an unmatched one is assigned by its own center.
     """
-    counted, hits = BANDS[band](pairs.found), matched != UNMATCHED
+    counted, hits = BANDS[band](pairs.detections), matched != UNMATCHED
     held = BANDS[band](pairs.objects)
     counted[hits] = held[matched[hits]]
     return counted, hits, int(held.sum())

@@ -39,19 +39,21 @@ def predictions_by_frame(path: Path, split: LabeledSplit) -> dict[str, NamedReco
     """
     known, times = set(split.frame_ids), split.times_s if isinstance(split, BoxSplit) else {}
     timed_ids, stamps_s = tuple(times), np.array(list(times.values()))
-    found: dict[str, NamedRecords] = {}
+    predictions: dict[str, NamedRecords] = {}
     for line in read_frames(path):
         frame_id = _frame_of_line(line, known, timed_ids, stamps_s)
-        if frame_id in found:
-            raise DatasetError(f"{line.place}: frame {frame_id} has predictions in {found[frame_id].place}; join them")
+        if frame_id in predictions:
+            raise DatasetError(
+                f"{line.place}: frame {frame_id} has predictions in {predictions[frame_id].place}; join them"
+            )
         if frame_id is not None:
-            found[frame_id] = line
-    if not found:
+            predictions[frame_id] = line
+    if not predictions:
         raise DatasetError(
             f"{path}: no line belongs to a frame of {split.root} such as {min(known)}; name its scans or, for "
             "predictions of a recording, give its labels the recording's `time_s`"
         )
-    return found
+    return predictions
 
 
 def stated_scope(path: Path, lines: Iterable[NamedRecords]) -> DetectorScope | None:
@@ -65,16 +67,16 @@ def stated_scope(path: Path, lines: Iterable[NamedRecords]) -> DetectorScope | N
     stated = {line.detector for line in lines}
     if stated != {None}:
         return stated.pop() if len(stated) == 1 else None
-    beside = path.parent / "recording.json"
-    if not beside.is_file():
+    recording = path.parent / "recording.json"
+    if not recording.is_file():
         return None
     try:
-        scope = scope_from_json(json.loads(beside.read_text(encoding="utf-8")))
+        scope = scope_from_json(json.loads(recording.read_text(encoding="utf-8")))
         if scope is None:
             raise ValueError("it states no classes and ranges")
         return scope
     except (OSError, ValueError, RecursionError) as error:
-        raise DatasetError(f"{beside}: cannot be read ({str(error)[:80]}); run asca detect --track again") from None
+        raise DatasetError(f"{recording}: cannot be read ({str(error)[:80]}); run asca detect --track again") from None
 
 
 def _frame_of_line(
@@ -149,9 +151,9 @@ def write_box_predictions(
     level = split.mounting.level
     with path.open("w", encoding="utf-8") as file:
         for frame_id in reporter.track(split.frame_ids, "Detecting"):
-            found = detect(split.points(frame_id, camera_view=camera_view))
-            boxes = found.boxes if level.is_identity else level.inverse.boxes(found.boxes)
-            records = records_from(boxes, found.names, found.scores)
+            detections = detect(split.points(frame_id, camera_view=camera_view))
+            boxes = detections.boxes if level.is_identity else level.inverse.boxes(detections.boxes)
+            records = records_from(boxes, detections.names, detections.scores)
             file.write(json_line(f"{frame_id}{split.scan_path(frame_id).suffix}", records, detector=scope))
 
 
@@ -179,20 +181,22 @@ def read_box_predictions(path: Path, split: LabeledSplit, *, reporter: Reporter 
         points = split.points(frame_id, camera_view=False)
         visible = np.asarray(points_in_boxes(points, objects).any(axis=0))
         records = predictions[frame_id].records
-        found = records.boxes if level.is_identity else level.boxes(records.boxes)
-        kept = np.flatnonzero(_can_be_evaluated(split, frame_id, objects, found))
-        found_types = tuple(records.types[row] for row in kept)
-        frames.append(EvaluatedFrame(frame_id, objects, types, visible, found[kept], found_types, records.scores[kept]))
+        detections = records.boxes if level.is_identity else level.boxes(records.boxes)
+        kept = np.flatnonzero(_can_be_evaluated(split, frame_id, objects, detections))
+        detection_types = tuple(records.types[row] for row in kept)
+        frames.append(
+            EvaluatedFrame(frame_id, objects, types, visible, detections[kept], detection_types, records.scores[kept])
+        )
     missing = tuple(frame_id for frame_id in split.frame_ids if frame_id not in predictions)
     return BoxFrames(tuple(frames), missing, stated_scope(path, predictions.values()))
 
 
 def _can_be_evaluated(
-    split: LabeledSplit, frame_id: str, objects: NDArray[np.float32], found: NDArray[np.float32]
+    split: LabeledSplit, frame_id: str, objects: NDArray[np.float32], detections: NDArray[np.float32]
 ) -> NDArray[np.bool_]:
     """Return the mask of the boxes (N, 7) in the labelled view, or close enough to one of `objects` to match it."""
-    apart = np.linalg.norm(found[:, None, :2] - objects[None, :, :2], axis=2)
-    return np.asarray(split.in_labeled_view(frame_id, found[:, :3]) | (apart < NEAR_LABEL_M).any(axis=1))
+    apart = np.linalg.norm(detections[:, None, :2] - objects[None, :, :2], axis=2)
+    return np.asarray(split.in_labeled_view(frame_id, detections[:, :3]) | (apart < NEAR_LABEL_M).any(axis=1))
 
 
 def _require_scores(lines: Iterable[NamedRecords]) -> None:

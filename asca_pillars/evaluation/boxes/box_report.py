@@ -101,9 +101,9 @@ def _scope_note(report: BoxReport) -> str | None:
         )
     count = outside = 0
     for frame in report.frames.frames:
-        own = np.array([kind in report.class_names for kind in frame.object_types], bool) & frame.visible
-        count += int(own.sum())
-        outside += int((own & ~scope.holds(frame.objects)).sum())
+        evaluated = np.array([kind in report.class_names for kind in frame.object_types], bool) & frame.visible
+        count += int(evaluated.sum())
+        outside += int((evaluated & ~scope.holds(frame.objects)).sum())
     if not outside:
         return None
     return (
@@ -139,9 +139,9 @@ def _iou_table(report: BoxReport) -> TextTable:
     everywhere = [item for item in report.iou if item.band == _ALL]
     rows = []
     for name in report.class_names:
-        own = [item for item in everywhere if item.class_name == name]
-        values: dict[tuple[str, float], float | None] = {(item.metric, item.min_iou): item.ap for item in own}
-        rows.append((name, str(own[0].objects), *(_percent(values[column]) for column in columns)))
+        scores = [item for item in everywhere if item.class_name == name]
+        values: dict[tuple[str, float], float | None] = {(item.metric, item.min_iou): item.ap for item in scores}
+        rows.append((name, str(scores[0].objects), *(_percent(values[column]) for column in columns)))
     means = [_mean([item.ap for item in everywhere if (item.metric, item.min_iou) == column]) for column in columns]
     heads = [f"{titles[metric]}\n{least:g}" for metric, least in columns]
     return TextTable(
@@ -150,14 +150,14 @@ def _iou_table(report: BoxReport) -> TextTable:
 
 
 def _nuscenes_table(report: BoxReport) -> TextTable:
-    own = [item for item in report.nuscenes if item.band == _ALL]
+    scores = [item for item in report.nuscenes if item.band == _ALL]
     rows = []
-    for item in own:
+    for item in scores:
         each = [None] * len(DISTANCES_M) if item.ap_by_distance is None else list(item.ap_by_distance)
         own_errors = (_decimal(item.ate_m), _decimal(item.ase), _decimal(item.aoe_rad))
         rows.append((item.class_name, _percent(item.ap), *map(_tenth, each), *own_errors))
-    mean = ("mean", _percent(_mean([item.ap for item in own])))
-    errors = [_decimal(_mean([getattr(item, name) for item in own])) for name in ("ate_m", "ase", "aoe_rad")]
+    mean = ("mean", _percent(_mean([item.ap for item in scores])))
+    errors = [_decimal(_mean([getattr(item, name) for item in scores])) for name in ("ate_m", "ase", "aoe_rad")]
     heads = ("class", "AP", *(f"AP\n{limit:g} m" for limit in DISTANCES_M), "ATE\nm", "ASE", "AOE\nrad")
     return TextTable("nuScenes' metrics", heads, (*rows, (*mean, *[""] * len(DISTANCES_M), *errors)), left=1)
 

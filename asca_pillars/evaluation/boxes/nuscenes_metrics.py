@@ -85,13 +85,13 @@ def _score(pairs: BoxPairs, matches: dict[float, NDArray[np.int64]], name: str, 
         counted, hits, objects = in_band(pairs, matched, band)
         if not objects:
             return NuScenesScore(name, band, 0, None, None, None, None, None)
-        own = hits[counted]
-        precision = _at_recalls(own, np.cumsum(own) / np.arange(1, len(own) + 1), objects)
+        counted_hits = hits[counted]
+        precision = _at_recalls(counted_hits, np.cumsum(counted_hits) / np.arange(1, len(counted_hits) + 1), objects)
         by_distance.append(float(100 * np.maximum(precision[_FIRST:] - _FLOOR, 0).mean() / (1 - _FLOOR)))
         if limit_m == ERROR_DISTANCE_M:
             true = counted & hits
-            each = match_errors(pairs.found[true], pairs.objects[matched[true]])
-            errors = _mean_errors(each, pairs.scores[true], _at_recalls(own, pairs.scores[counted], objects))
+            each = match_errors(pairs.detections[true], pairs.objects[matched[true]])
+            errors = _mean_errors(each, pairs.scores[true], _at_recalls(counted_hits, pairs.scores[counted], objects))
     return NuScenesScore(name, band, objects, float(np.mean(by_distance)), tuple(by_distance), *errors)
 
 

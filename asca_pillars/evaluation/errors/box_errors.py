@@ -150,9 +150,9 @@ def match_frame(
     types = np.array(frame.types, dtype=object)
     of_class = types == class_name
     related = of_class | (types == NEIGHBOR_TYPES.get(class_name, ""))
-    order = np.flatnonzero(np.array(frame.found_types, dtype=object) == class_name)
+    order = np.flatnonzero(np.array(frame.detection_types, dtype=object) == class_name)
     order = order[np.argsort(-frame.scores[order], kind="stable")]
-    boxes, scores, ignored = frame.found[order], frame.scores[order], frame.ignored[order]
+    boxes, scores, ignored = frame.detections[order], frame.scores[order], frame.ignored[order]
     reported = scores >= score
     overlap = bev_iou(boxes, frame.objects)
 
@@ -201,23 +201,23 @@ def match_frame(
     return objects, detections
 
 
-def box_residuals(found: Floats, labels: Floats) -> Floats:
-    """Compute errors of boxes found[k] against labels[k], sensor at the origin: (K, 7), (K, 7) -> (K, len(RESIDUALS)).
+def box_residuals(detections: Floats, labels: Floats) -> Floats:
+    """Compute errors of detections[k] against labels[k], sensor at the origin: (K, 7), (K, 7) -> (K, len(RESIDUALS)).
 
     A box rotated by more than 45 degrees against its label's axis is compared along its other axis: its extent
     gives ends and sides, and its heading error is the rotation itself.
     """
-    turn = wrap_angle(found[:, 6] - labels[:, 6])
+    turn = wrap_angle(detections[:, 6] - labels[:, 6])
     axis_turn = wrap_angle(turn, np.pi)
     across_first = np.abs(axis_turn) > np.pi / 4
-    length, width = np.where(across_first, found[:, [4, 3]].T, found[:, [3, 4]].T)
+    length, width = np.where(across_first, detections[:, [4, 3]].T, detections[:, [3, 4]].T)
     axis, near_side = _ray_facing_axes(labels)
-    offset = found[:, :2] - labels[:, :2]
+    offset = detections[:, :2] - labels[:, :2]
     along = (offset * axis).sum(axis=1)
     across = near_side * (offset[:, 1] * axis[:, 0] - offset[:, 0] * axis[:, 1])
     line = labels[:, :2] / np.maximum(np.linalg.norm(labels[:, :2], axis=1, keepdims=True), 1e-9)
-    bottom = (found[:, 2] - found[:, 5] / 2) - (labels[:, 2] - labels[:, 5] / 2)
-    top = (found[:, 2] + found[:, 5] / 2) - (labels[:, 2] + labels[:, 5] / 2)
+    bottom = (detections[:, 2] - detections[:, 5] / 2) - (labels[:, 2] - labels[:, 5] / 2)
+    top = (detections[:, 2] + detections[:, 5] / 2) - (labels[:, 2] + labels[:, 5] / 2)
     longer, wider = (length - labels[:, 3]) / 2, (width - labels[:, 4]) / 2
     columns = {
         "near_end": longer - along,
@@ -422,8 +422,8 @@ def _describe_one(points: NDArray[np.float32], ground: Ground | None, box: NDArr
 def _joined_extent(offset: NDArray[np.float64], inside: NDArray[np.bool_]) -> tuple[float, float]:
     """Return length and width, metres, of the cluster with most points (N,) of a box, among points (N, 2)."""
     labels = cluster_labels(offset)
-    own = np.bincount(labels[inside]).argmax()
-    joined = offset[labels == own] if own else offset[inside]
+    main_cluster = np.bincount(labels[inside]).argmax()
+    joined = offset[labels == main_cluster] if main_cluster else offset[inside]
     centered = joined - joined.mean(axis=0)
     _, axes = np.linalg.eigh(centered.T @ centered)
     width, length = np.ptp(centered @ axes, axis=0)

@@ -42,8 +42,8 @@ class ErrorFrame:
         truncated: (M,) 0..1, 0 where unknown.
         object_points: (M,) points in each box.
         counted: (M,) objects that are counted: within the protocol's limits and with a point inside.
-        found: (D, 7) detected boxes.
-        found_types: types of the detections.
+        detections: (D, 7) detected boxes.
+        detection_types: types of the detections.
         scores: (D,).
         ignored: (D,) detections that are never false: in a DontCare area, or below KITTI's minimum height in the image.
     """
@@ -56,8 +56,8 @@ class ErrorFrame:
     truncated: NDArray[np.float64]
     object_points: NDArray[np.int64]
     counted: NDArray[np.bool_]
-    found: NDArray[np.float64]
-    found_types: tuple[str, ...]
+    detections: NDArray[np.float64]
+    detection_types: tuple[str, ...]
     scores: NDArray[np.float64]
     ignored: NDArray[np.bool_]
 
@@ -95,11 +95,11 @@ class KittiErrorFrames:
         calibration = self.split.calibration(frame_id)
         labelled = read_labels(self.labels / f"{frame_id}.txt")
         truth = [item for item in labelled if item.has_box_3d]
-        found = [item for item in read_labels(self.predictions / f"{frame_id}.txt") if item.has_box_3d]
+        detections = [item for item in read_labels(self.predictions / f"{frame_id}.txt") if item.has_box_3d]
         points = self.split.points(frame_id, camera_view=True)
         boxes = boxes_from_objects(truth, calibration).astype(np.float64)
         inside = points_in_boxes(points, boxes).sum(axis=0)
-        flat_truth, flat_found = frame_objects(frame_id, truth), frame_objects(frame_id, found)
+        flat_truth, flat_found = frame_objects(frame_id, truth), frame_objects(frame_id, detections)
         flat_areas = frame_objects(frame_id, [item for item in labelled if not item.has_box_3d])
         return ErrorFrame(
             frame_id=frame_id,
@@ -110,8 +110,8 @@ class KittiErrorFrames:
             truncated=np.maximum(flat_truth.truncated, 0.0),
             object_points=inside,
             counted=_counted(flat_truth, self.class_names) & (inside > 0),
-            found=boxes_from_objects(found, calibration).astype(np.float64),
-            found_types=tuple(self._spelling.get(item.type.casefold(), item.type) for item in found),
+            detections=boxes_from_objects(detections, calibration).astype(np.float64),
+            detection_types=tuple(self._spelling.get(item.type.casefold(), item.type) for item in detections),
             scores=flat_found.scores,
             ignored=_ignored(flat_found, flat_areas),
         )
@@ -153,10 +153,10 @@ class BoxErrorFrames:
             truncated=np.zeros(len(objects)),
             object_points=inside,
             counted=inside > 0,
-            found=change.boxes(np.asarray(frame.found)).astype(np.float64),
-            found_types=tuple(frame.found_types),
+            detections=change.boxes(np.asarray(frame.detections)).astype(np.float64),
+            detection_types=tuple(frame.detection_types),
             scores=np.asarray(frame.scores, np.float64),
-            ignored=np.zeros(len(frame.found), bool),
+            ignored=np.zeros(len(frame.detections), bool),
         )
 
     @cached_property

@@ -283,14 +283,14 @@ def write_errors(
         OutputError, OSError: a file cannot be written.
     """
     matches = match_frames(frames, scores, reporter=reporter)
-    own = summarize(matches, name, parts, reporter=reporter)
-    datasets = [*own, *(data for report in beside for data in report.datasets)]
+    dataset_errors = summarize(matches, name, parts, reporter=reporter)
+    datasets = [*dataset_errors, *(data for report in beside for data in report.datasets)]
     sections = worst_cases(matches)
     pictured = draw_cases(frames, matches, sections, reporter=reporter)
     notes, tables, more = error_notes(datasets), error_tables(datasets), group_tables(datasets)
     title = f"{subject}: errors"
     page = ReportPage(title, tables, notes[:PRINTED_NOTES])
-    write_json(out / JSON, to_dict(ErrorReport(subject, tuple(own), about)))
+    write_json(out / JSON, to_dict(ErrorReport(subject, tuple(dataset_errors), about)))
     write_text(out / MARKDOWN, ReportPage(title, [*tables, *more], notes).markdown() + _END)
     write_text(out / PAGE, error_page(title, tables, more, notes, pictured) + _END)
     return page

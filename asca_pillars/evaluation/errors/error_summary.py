@@ -329,9 +329,9 @@ class _Part:
         of_frame = np.array([item.frame for item in objects], np.int64)
         boxes = np.array([item.detection is not None for item in objects], bool)
         labels = np.array([item.box for item in objects if item.detection is not None]).reshape(-1, 7)
-        found = np.array([item.detection for item in objects if item.detection is not None]).reshape(-1, 7)
+        matched = np.array([item.detection for item in objects if item.detection is not None]).reshape(-1, 7)
         residuals = np.full((len(objects), len(RESIDUALS)), np.nan)
-        residuals[boxes] = box_residuals(found, labels)
+        residuals[boxes] = box_residuals(matched, labels)
         counted = np.array([item.counted for item in objects], bool)
         iou = min_overlap(name) if name in CLASS_NAMES else OTHER_IOU_3D
         detections = [
@@ -398,15 +398,15 @@ class _Part:
         result = {}
         for name, column in zip(names, values.T, strict=True):
             kept = np.isfinite(column)
-            own, where = column[kept], frames[kept]
-            if not len(own):
+            finite, where = column[kept], frames[kept]
+            if not len(finite):
                 result[name] = Spread(0, None, None, None, None)
             elif name in shares:
-                interval = self.draws.ratio_interval(self._by_frame(where, own), self._by_frame(where))
-                result[name] = Spread(len(own), float(own.mean()), None, None, interval)
+                interval = self.draws.ratio_interval(self._by_frame(where, finite), self._by_frame(where))
+                result[name] = Spread(len(finite), float(finite.mean()), None, None, interval)
             else:
-                low, middle, high = np.percentile(own, [10, 50, 90]).tolist()
-                result[name] = Spread(len(own), middle, low, high, self.draws.median_interval(own, where))
+                low, middle, high = np.percentile(finite, [10, 50, 90]).tolist()
+                result[name] = Spread(len(finite), middle, low, high, self.draws.median_interval(finite, where))
         return result
 
     def _by_frame(self, frames: NDArray[np.int64], values: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
@@ -460,7 +460,7 @@ def _shares_reaching(labels: NDArray[np.float64], residuals: NDArray[np.float64]
     systematic = np.median(residuals, axis=0)
     systematic[turned] = 0.0
     boxes[WITHOUT_MEDIANS] = boxes_from_residuals(labels, residuals - systematic)
-    return {name: float(np.mean(paired_iou_3d(own, labels) >= iou)) for name, own in boxes.items()}
+    return {name: float(np.mean(paired_iou_3d(fixed, labels) >= iou)) for name, fixed in boxes.items()}
 
 
 def _false_rates(detections: list[DetectionMatch], counted: int, frames: int) -> tuple[FalseRate, ...]:

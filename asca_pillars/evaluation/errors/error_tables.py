@@ -87,14 +87,14 @@ def _class_names(datasets: Sequence[DatasetErrors]) -> list[str]:
 
 
 def _box_table(datasets: Sequence[DatasetErrors], name: str, *, main: bool) -> TextTable:
-    found = [(data.name, _class_of(data, name)) for data in datasets]
-    groups = dict.fromkeys(group.group for _, one in found if one is not None for group in one.groups)
+    classes = [(data.name, _class_of(data, name)) for data in datasets]
+    groups = dict.fromkeys(group.group for _, one in classes if one is not None for group in one.groups)
     rows = [
-        (group, title, *_group_cells(own))
+        (group, title, *_group_cells(group_errors))
         for group in groups
         if (group in MAIN_GROUPS) is main
-        for title, one in found
-        if (own := _group_of(one, group)) is not None
+        for title, one in classes
+        if (group_errors := _group_of(one, group)) is not None
     ]
     titles = (_TITLES.get(column, column.replace("_", " ")) for column in _BOX_COLUMNS)
     columns = ("objects", "dataset", "n", "recall", "below score", "boxes", *titles)
@@ -203,7 +203,7 @@ def _class_of(data: DatasetErrors, name: str) -> ClassErrors | None:
 
 
 def _group_of(one: ClassErrors | None, group: str) -> GroupErrors | None:
-    return None if one is None else next((own for own in one.groups if own.group == group), None)
+    return None if one is None else next((item for item in one.groups if item.group == group), None)
 
 
 def _spread(spread: Spread, digits: int) -> str:

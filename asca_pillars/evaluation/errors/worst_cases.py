@@ -260,7 +260,7 @@ def draw_cases(
         others = [DrawnBox(box, "label") for box in frame.objects]
         others += [
             DrawnBox(box, "detection")
-            for box, kind, score in zip(frame.found, frame.found_types, frame.scores, strict=True)
+            for box, kind, score in zip(frame.detections, frame.detection_types, frame.scores, strict=True)
             if score >= matches.scores.get(kind, np.inf)
         ]
         for row, column in group:
@@ -298,8 +298,8 @@ def _missed_case(item: ObjectMatch) -> Case:
 
 def _box_sections(name: str, objects: Sequence[ObjectMatch]) -> list[CaseSection]:
     labels = np.array([item.box for item in objects]).reshape(-1, 7)
-    found = np.array([item.detection for item in objects]).reshape(-1, 7)
-    residuals = dict(zip(RESIDUALS, box_residuals(found, labels).T, strict=True))
+    detections = np.array([item.detection for item in objects]).reshape(-1, 7)
+    residuals = dict(zip(RESIDUALS, box_residuals(detections, labels).T, strict=True))
     titles = {
         "near_end": "Near end",
         "far_end": "Far end",

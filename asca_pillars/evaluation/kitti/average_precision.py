@@ -362,8 +362,8 @@ def evaluate(
     for (name, mine), difficulty in reporter.track(steps, "Matching"):
         own_pairs = pairs.where(mine[pairs.truth])
         for band in bands:
-            found = _curves(frames, own_pairs, dont_care, name, difficulty, band)
-            curves[band] |= {(name, curve.metric, difficulty): curve for curve in found}
+            of_band = _curves(frames, own_pairs, dont_care, name, difficulty, band)
+            curves[band] |= {(name, curve.metric, difficulty): curve for curve in of_band}
     overall, *banded = (KittiResults(curves[band], tuple(class_names), len(truth)) for band in bands)
     return KittiEvaluation(overall, dict(zip(bands_m, banded, strict=True)))
 
@@ -382,13 +382,13 @@ def _curves(
     )
     no_dontcare = states._replace(in_dont_care=np.zeros_like(states.in_dont_care))
     similarity = (1 + np.cos(truth.alpha[pairs.truth] - detections.alpha[pairs.detection])) / 2
-    own = is_type(detections, class_name)
+    of_class = is_type(detections, class_name)
     for metric, known, metric_states in (
         ("bbox", detections.bbox[:, 0] >= 0, states),
         ("bev", detections.locations[:, 0] != _UNKNOWN_M, no_dontcare),
         ("3d", detections.locations[:, 1] != _UNKNOWN_M, no_dontcare),
     ):
-        if (own & known).any():
+        if (of_class & known).any():
             enough = pairs.overlaps[metric] > minimum
             counts = count(pairs.where(enough), metric, metric_states, similarity[enough], _RECALL_STEPS)
             yield _curve(class_name, metric, difficulty, counts, counts.tp)

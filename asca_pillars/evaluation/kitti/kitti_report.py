@@ -183,10 +183,10 @@ def _share_table(
 
 def _share_band_table(points: Sequence[OperatingPoint]) -> TextTable:
     """Return a table with a row for each band, and recall and precision of each class."""
-    own = {(p.band_m, p.class_name): p for p in points if p.band_m is not None and p.difficulty == "moderate"}
-    bands, names = (tuple(dict.fromkeys(keys)) for keys in zip(*own, strict=True)) if own else ((), ())
+    of_bands = {(p.band_m, p.class_name): p for p in points if p.band_m is not None and p.difficulty == "moderate"}
+    bands, names = (tuple(dict.fromkeys(keys)) for keys in zip(*of_bands, strict=True)) if of_bands else ((), ())
     rows = tuple(
-        (f"{low:g}-{high:g} m", *(_share_cell(own[(low, high), name]) for name in names)) for low, high in bands
+        (f"{low:g}-{high:g} m", *(_share_cell(of_bands[(low, high), name]) for name in names)) for low, high in bands
     )
     title = "Recall / precision (%) in 3D at these scores by distance, moderate, in brackets the counted objects"
     return TextTable(title, ("distance", *names), rows, left=1)

@@ -169,9 +169,9 @@ def truth_states(
     limits = LIMITS[difficulty]
     beyond = truth.bbox[:, 3] - truth.bbox[:, 1] < limits.min_height_px
     beyond |= (truth.occluded > limits.max_occluded) | (truth.truncated > limits.max_truncated)
-    own = is_type(truth, class_name)
-    counted = own & ~beyond & _in_band(truth, band_m)
-    return _states(counted, own | is_neighbor(truth, class_name))
+    of_class = is_type(truth, class_name)
+    counted = of_class & ~beyond & _in_band(truth, band_m)
+    return _states(counted, of_class | is_neighbor(truth, class_name))
 
 
 def detection_states(
@@ -184,8 +184,8 @@ def detection_states(
     [low, high) are ignored.
     """
     low = np.abs(detections.bbox[:, 1] - detections.bbox[:, 3]) < LIMITS[difficulty].min_height_px
-    own = is_type(detections, class_name)
-    return _states(own & ~low & _in_band(detections, band_m), own | low)
+    of_class = is_type(detections, class_name)
+    return _states(of_class & ~low & _in_band(detections, band_m), of_class | low)
 
 
 def _in_band(objects: FrameObjects, band_m: _Band | None) -> NDArray[np.bool_]:
@@ -261,14 +261,14 @@ def overlapping_pairs(
         reporter: for the progress.
     """
     truth_boxes, detection_boxes = _upright_boxes(frames.truth), _upright_boxes(frames.detections)
-    found = []
+    blocks = []
     for truths in reporter.track(list(_blocks(frames, truth_mask)), "Overlaps"):
         pairs = _all_pairs(frames, truths)
         image = _image_iou(frames.detections.bbox[pairs.detection], frames.truth.bbox[pairs.truth])
         bev, solid = _ground_iou(detection_boxes[pairs.detection], truth_boxes[pairs.truth])
         pairs = Pairs(pairs.truth, pairs.detection, pairs.frame, {"bbox": image, "bev": bev, "3d": solid})
-        found.append(pairs.where((image > above) | (bev > above) | (solid > above)))
-    return _joined(found)
+        blocks.append(pairs.where((image > above) | (bev > above) | (solid > above)))
+    return _joined(blocks)
 
 
 def dont_care_shares(frames: Frames) -> _Doubles:

@@ -83,13 +83,13 @@ def convert_state(
         )
     converted = {}
     for source, target, convert in key_mappings:
-        found = convert(state[source])
-        if found.shape != our_state[target].shape:
+        array = convert(state[source])
+        if array.shape != our_state[target].shape:
             raise TrainingError(
                 f"{path_text}: {source} has shape {tuple(state[source].shape)}, which does not fit {target} "
                 f"{tuple(our_state[target].shape)}; give the model's configuration with --config"
             )
-        converted[target] = found.to(our_state[target].dtype).contiguous()
+        converted[target] = array.to(our_state[target].dtype).contiguous()
     counters = {name: value for name, value in our_state.items() if name.endswith(_COUNTER)}
     assert converted.keys() | counters.keys() == our_state.keys(), "a part of our network has no mapping"
     return counters | converted
@@ -117,17 +117,17 @@ def map_backbone_keys(block_convs: Sequence[int], first: Callable[[Tensor], Tens
             stand in another order.
     """
     for block, convs in enumerate(block_convs):
-        there, here = f"backbone_2d.blocks.{block}", f"neck.blocks.{block}"
+        source, target = f"backbone_2d.blocks.{block}", f"neck.blocks.{block}"
         for layer in range(0, 3 * (convs + 1), 3):  # convolution, normalization, ReLU; theirs begins with a padding
             convert = first if block == layer == 0 else identity
-            yield KeyMapping(f"{there}.{layer + 1}.weight", f"{here}.{layer}.weight", convert)
-            yield from norm_keys(f"{there}.{layer + 2}", f"{here}.{layer + 1}")
-        there, here = f"backbone_2d.deblocks.{block}", f"neck.deblocks.{block}"
-        yield KeyMapping(f"{there}.0.weight", f"{here}.0.weight")
-        yield from norm_keys(f"{there}.1", f"{here}.1")
-    for here, there in _HEADS.items():
+            yield KeyMapping(f"{source}.{layer + 1}.weight", f"{target}.{layer}.weight", convert)
+            yield from norm_keys(f"{source}.{layer + 2}", f"{target}.{layer + 1}")
+        source, target = f"backbone_2d.deblocks.{block}", f"neck.deblocks.{block}"
+        yield KeyMapping(f"{source}.0.weight", f"{target}.0.weight")
+        yield from norm_keys(f"{source}.1", f"{target}.1")
+    for target, source in _HEADS.items():
         for part in ("weight", "bias"):
-            yield KeyMapping(f"dense_head.{there}.{part}", f"head.{here}.{part}")
+            yield KeyMapping(f"dense_head.{source}.{part}", f"head.{target}.{part}")
 
 
 _LAYOUTS = (
@@ -147,7 +147,7 @@ def dense_order(pairs: Sequence[tuple[Tensor, Tensor]]) -> Callable[[Tensor], Te
         pairs: of each layer theirs, and ours.
     """
     for axes in _LAYOUTS:
-        if all(theirs.ndim == len(axes) and theirs.permute(axes).shape == ours.shape for theirs, ours in pairs):
+        if all(source.ndim == len(axes) and source.permute(axes).shape == target.shape for source, target in pairs):
             return lambda weight: weight.permute(axes)
     return lambda weight: weight
 
@@ -240,11 +240,13 @@ def _voxel_keys(state: Mapping[str, Tensor], our_state: Mapping[str, Tensor]) ->
     for level in range(1, len(LEVEL_SOURCES)):
         names = (f"down.{level - 1}", f"same.{level}.0", f"same.{level}.1")
         layers |= {f"conv{level + 1}.{number}": name for number, name in enumerate(names)}
-    weights = {f"backbone_3d.{there}.0.weight": f"voxels.{here}.convolution.weight" for there, here in layers.items()}
-    convert = dense_order([(state[there], our_state[here]) for there, here in weights.items() if there in state])
-    yield from (KeyMapping(there, here, convert) for there, here in weights.items())
-    for there, here in layers.items():
-        yield from norm_keys(f"backbone_3d.{there}.1", f"voxels.{here}.norm")
+    weights = {
+        f"backbone_3d.{source}.0.weight": f"voxels.{target}.convolution.weight" for source, target in layers.items()
+    }
+    convert = dense_order([(state[source], our_state[target]) for source, target in weights.items() if source in state])
+    yield from (KeyMapping(source, target, convert) for source, target in weights.items())
+    for source, target in layers.items():
+        yield from norm_keys(f"backbone_3d.{source}.1", f"voxels.{target}.norm")
 
 
 def _keypoint_keys(model: PvRcnnModel) -> Iterator[KeyMapping]:
@@ -268,27 +270,27 @@ def _keypoint_keys(model: PvRcnnModel) -> Iterator[KeyMapping]:
 def _refine_keys(model: PvRcnnModel) -> Iterator[KeyMapping]:
     widths, radii = model.network.grid_widths, len(model.settings.grid_radii_m)
     for radius in range(radii):
-        there = f"roi_head.roi_grid_pool_layer.mlps.{radius}"
-        yield from _ball_keys(there, f"refine.pools.{radius}", len(widths))
+        source = f"roi_head.roi_grid_pool_layer.mlps.{radius}"
+        yield from _ball_keys(source, f"refine.pools.{radius}", len(widths))
     cells, channels = model.settings.grid_size**3, radii * widths[-1]
     order = torch.arange(cells * channels).view(channels, cells).T.flatten()
     dropout = bool(model.network.dropout)  # without it ours has no layer for it
-    for there, here in (("shared_fc_layer", "shared"), ("cls_layers", "confidence"), ("reg_layers", "residuals")):
+    for source, target in (("shared_fc_layer", "shared"), ("cls_layers", "confidence"), ("reg_layers", "residuals")):
         for layer in (0, 4):  # linear, normalization, ReLU, dropout
-            convert = _channels_of(order) if (there, layer) == ("shared_fc_layer", 0) else squeeze_kernel
-            own = 3 + dropout if layer else 0
-            yield KeyMapping(f"roi_head.{there}.{layer}.weight", f"refine.{here}.{own}.weight", convert)
-            yield from norm_keys(f"roi_head.{there}.{layer + 1}", f"refine.{here}.{own + 1}")
-        if there != "shared_fc_layer":
-            last = f"refine.{here}.{6 + dropout}"
-            yield KeyMapping(f"roi_head.{there}.7.weight", f"{last}.weight", squeeze_kernel)
-            yield KeyMapping(f"roi_head.{there}.7.bias", f"{last}.bias")
+            convert = _channels_of(order) if (source, layer) == ("shared_fc_layer", 0) else squeeze_kernel
+            target_layer = 3 + dropout if layer else 0
+            yield KeyMapping(f"roi_head.{source}.{layer}.weight", f"refine.{target}.{target_layer}.weight", convert)
+            yield from norm_keys(f"roi_head.{source}.{layer + 1}", f"refine.{target}.{target_layer + 1}")
+        if source != "shared_fc_layer":
+            last = f"refine.{target}.{6 + dropout}"
+            yield KeyMapping(f"roi_head.{source}.7.weight", f"{last}.weight", squeeze_kernel)
+            yield KeyMapping(f"roi_head.{source}.7.bias", f"{last}.bias")
 
 
-def _ball_keys(there: str, here: str, layers: int) -> Iterator[KeyMapping]:
+def _ball_keys(source: str, target: str, layers: int) -> Iterator[KeyMapping]:
     for number in range(layers):
-        yield KeyMapping(f"{there}.{3 * number}.weight", f"{here}.layers.{number}.weight", squeeze_kernel)
-        yield from norm_keys(f"{there}.{3 * number + 1}", f"{here}.norms.{number}")
+        yield KeyMapping(f"{source}.{3 * number}.weight", f"{target}.layers.{number}.weight", squeeze_kernel)
+        yield from norm_keys(f"{source}.{3 * number + 1}", f"{target}.norms.{number}")
 
 
 def _level(model: PvRcnnModel, source: str) -> int:
@@ -313,8 +315,8 @@ def _joined_order(model: PvRcnnModel) -> Tensor:
     for source in _JOINED:
         starts[source] = start
         start += widths.get(source, 0)
-    own = [torch.arange(widths[each.source]) + starts[each.source] for each in model.settings.sources]
-    return torch.cat([*own, of_map])
+    orders = [torch.arange(widths[each.source]) + starts[each.source] for each in model.settings.sources]
+    return torch.cat([*orders, of_map])
 
 
 def _channels_of(order: Tensor) -> Callable[[Tensor], Tensor]:

@@ -82,9 +82,9 @@ def states_by_class(state: Tensor, scores: int) -> Tensor:
     states = state.reshape(-1, 1)
     if scores == 1:
         return states
-    own = torch.arange(state.shape[-1], device=state.device) // len(ANCHOR_YAWS_RAD)
-    is_own = own[:, None] == torch.arange(scores, device=state.device)  # (A, scores)
-    is_own = is_own.expand(len(states) // len(own), -1, -1).flatten(0, 1)
+    anchor_class = torch.arange(state.shape[-1], device=state.device) // len(ANCHOR_YAWS_RAD)
+    is_own = anchor_class[:, None] == torch.arange(scores, device=state.device)  # (A, scores)
+    is_own = is_own.expand(len(states) // len(anchor_class), -1, -1).flatten(0, 1)
     return torch.where((states == 1) & ~is_own, torch.zeros_like(states), states)
 
 
@@ -146,11 +146,11 @@ def overlaps_found(residuals: Tensor, targets: TargetBatch) -> Tensor:
     anchors, directions = targets.anchors.cpu().numpy(), targets.directions.cpu().numpy()
     with np.errstate(over="ignore", invalid="ignore"):  # an overflowing box overlaps nothing
         # Half a turn changes no overlap, so the direction that is predicted does not matter.
-        found, wanted = (
+        predicted, target = (
             decode_boxes(each.detach().cpu().numpy(), directions, anchors).astype(np.float64)
             for each in (residuals, targets.residuals)
         )
-        return torch.from_numpy(paired_iou_3d(found, wanted)).to(residuals)
+        return torch.from_numpy(paired_iou_3d(predicted, target)).to(residuals)
 
 
 def box_loss(residuals: Tensor, targets: Tensor, beta: float, weights: Tensor | float = 1.0) -> Tensor:
@@ -194,9 +194,9 @@ def distillation_loss(maps: HeadMaps[Tensor], teacher: HeadMaps[Tensor], config:
     foreground = scores[:, 0] >= FOREGROUND_SCORE
     weights = scores[foreground]
     total = weights.sum().clamp(min=1.0)
-    residuals, wanted = (_by_anchor(each.boxes, values=7)[foreground].float() for each in (maps, teacher))
+    residuals, teacher_residuals = (_by_anchor(each.boxes, values=7)[foreground].float() for each in (maps, teacher))
     directions, bins = (_by_anchor(each.directions, values=2)[foreground].float() for each in (maps, teacher))
-    box = box_loss(residuals, wanted, config.smooth_l1_beta, weights)
+    box = box_loss(residuals, teacher_residuals, config.smooth_l1_beta, weights)
     direction = weights[:, 0] * F.cross_entropy(directions, torch.softmax(bins, dim=1), reduction="none")
     return DistillationTerms(
         config.box_weight * box / total,

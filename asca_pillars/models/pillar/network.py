@@ -119,13 +119,13 @@ class PillarDetector(Trainable):
         neck = outputs.neck
         if neck is None:
             return [spec.decode(HeadMaps(*frame)) for frame in zip(*arrays, strict=True)]
-        cells, map_cells, first, found = neck.head_cells.cpu().numpy(), math.prod(neck.map_shape), 0, []
+        cells, map_cells, first, detections = neck.head_cells.cpu().numpy(), math.prod(neck.map_shape), 0, []
         for frame, rows in enumerate(neck.frame_rows):
-            own = slice(first, first + rows)
-            maps = HeadMaps(*(part[own] for part in arrays))
-            found.append(spec.decode(maps, cells[own] - frame * map_cells))
+            frame_slice = slice(first, first + rows)
+            maps = HeadMaps(*(part[frame_slice] for part in arrays))
+            detections.append(spec.decode(maps, cells[frame_slice] - frame * map_cells))
             first += rows
-        return found
+        return detections
 
     def pool(self, pillar_features: Tensor, batch: PillarBatch) -> tuple[Tensor, Tensor, Sequence[int]]:
         """Pool pillar features (P, C) -> features (M, C) and cells (M,) of the map, and their number in each frame.

@@ -52,15 +52,15 @@ def load_trained_pillars(source: str, key: str) -> TrainedPillars:
         BundleError: the bundle is missing, damaged, or holds no checkpoint.
         ConfigError: it is of another kind, or a bundle in 8 bits.
     """
-    found = _find_weights(source, key)
-    checkpoint = read_checkpoint(found.path)
+    weights = _find_weights(source, key)
+    checkpoint = read_checkpoint(weights.path)
     model = checkpoint.config.model
     require_pillar_kind(source, model.kind)
     assert isinstance(model, PillarModel), "it is of kind pillar"
-    spec = model.spec if found.spec is None else found.spec
+    spec = model.spec if weights.spec is None else weights.spec
     network = build_pillar_detector(replace(model, spec=spec)).eval()
     checkpoint.fill(network)
-    return TrainedPillars(network, spec, found.identity or weights_sha256(network.state_dict()))
+    return TrainedPillars(network, spec, weights.identity or weights_sha256(network.state_dict()))
 
 
 class _Weights(NamedTuple):
@@ -123,12 +123,12 @@ class Distillation:
             raise ConfigError(f"train.teacher = {teacher}: only model.kind pillar learns from one; leave it out")
         self._network, spec, _ = load_trained_pillars(teacher, "train.teacher")
         self._loss, self._weight = model.loss, config.train.teacher_weight
-        ours, theirs = model.network, self._network.preparation
+        student, teaching = model.network, self._network.preparation
         if _anchors(spec) != _anchors(model.spec):
             raise ConfigError(
                 f"train.teacher = {teacher}: its model.spec is another; give both the same grid, limits and classes"
             )
-        if theirs.active_cells != (ours.active_cells if ours.neck == "sparse" else None):
+        if teaching.active_cells != (student.active_cells if student.neck == "sparse" else None):
             raise ConfigError(
                 f"train.teacher = {teacher}: its neck is another; give both the same model.network.neck and "
                 "model.network.active_cells"
@@ -138,8 +138,8 @@ class Distillation:
         """Return the weighted terms by name, scalars, for the detector's outputs of a batch (`LabeledPillars`)."""
         network = self._network.to(batch.pillars.features.device)
         with torch.no_grad():
-            wanted = network(batch.pillars)
-        terms = distillation_loss(outputs.maps, wanted, self._loss)._asdict()
+            teacher = network(batch.pillars)
+        terms = distillation_loss(outputs.maps, teacher, self._loss)._asdict()
         return {name: self._weight * term for name, term in terms.items()}
 
 

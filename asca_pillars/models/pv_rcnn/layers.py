@@ -61,12 +61,12 @@ class Adjustment(nn.Module):
             features: F.
             counted: (M, T) 1 for the members of each group, 0 for what only fills it.
         """
-        own = features * (1 + self.out(torch.relu(self.hidden(features))))
+        adjusted = features * (1 + self.out(torch.relu(self.hidden(features))))
         difference = features[:, :, None] - features[:, None]  # (M, T, T, C): F_i - F_j, zero where i is j
         # The hidden layer is linear before its ReLU: W (F_i - F_j) + b = W F_i - W F_j + b.
         within = F.linear(features, self.hidden.weight)
         impact = self.out(torch.relu(within[:, :, None] - within[:, None] + self.hidden.bias))
-        return own + (impact * difference * counted[:, None, :, None]).sum(dim=2)
+        return adjusted + (impact * difference * counted[:, None, :, None]).sum(dim=2)
 
 
 class AdaptiveScales(nn.Module):
@@ -88,15 +88,15 @@ class AdaptiveScales(nn.Module):
 
     def forward(self, points: Tensor, scales: Sequence[PointScale[Tensor]]) -> Tensor:
         """Encode points (N, 3 + in_channels), x, y, z in metres, and their scales -> features (K, out_channels)."""
-        positions, features, found = points[:, :3], points[:, 3:], []
+        positions, features, by_scale = points[:, :3], points[:, 3:], []
         for lift, adjust, scale in zip(self.lift, self.adjust, scales, strict=True):
             assert isinstance(lift, SetAbstraction)
             grouped = lift.grouped(positions, features, scale.positions, scale.groups)  # (M, T, C)
             features = adjust(grouped, first_occurrences(scale.groups, positions.shape[0])).max(dim=1).values
             positions = scale.positions
-            found.append(features)
-        joined = found[-1]
-        for finer, scale in zip(found[-2::-1], scales[:0:-1], strict=True):
+            by_scale.append(features)
+        joined = by_scale[-1]
+        for finer, scale in zip(by_scale[-2::-1], scales[:0:-1], strict=True):
             joined = torch.cat([finer, _interpolated(joined, scale)], dim=1)
         described: Tensor = self.join(joined)
         return described
@@ -147,11 +147,11 @@ class PaperDeformation(nn.Module):
         assert around.nearest is not None and around.nearest_weights is not None
         index = around.indices[-1]
         offsets = F.pad(self.offset(around.features), (0, 0, 0, 1))  # linear: W (f_i - f_j) = W f_i - W f_j
-        own = (_gathered(offsets, around.nearest) * around.nearest_weights[:, :, None]).sum(dim=1)  # (K, 16)
+        offset = (_gathered(offsets, around.nearest) * around.nearest_weights[:, :, None]).sum(dim=1)  # (K, 16)
         relative, _ = _relative(around, index)  # v_j - v_i
-        found = first_occurrences(index, around.positions.shape[0]).to(own)  # the sum has every neighbor once
-        difference = (own[:, None] - _gathered(offsets, index)) * found[:, :, None]
-        mean = difference.transpose(1, 2) @ -relative / found.sum(dim=1).clamp(min=1)[:, None, None]  # (K, 16, 3)
+        is_first = first_occurrences(index, around.positions.shape[0]).to(offset)  # the sum has every neighbor once
+        difference = (offset[:, None] - _gathered(offsets, index)) * is_first[:, :, None]
+        mean = difference.transpose(1, 2) @ -relative / is_first.sum(dim=1).clamp(min=1)[:, None, None]  # (K, 16, 3)
         return [around.keypoints + torch.tanh(self.align(torch.relu(mean).flatten(1)))]
 
 
@@ -169,10 +169,10 @@ class AuthorsDeformation(nn.Module):
         """Return (K, 3) per radius, metres."""
         shifted = []
         for index in around.indices:
-            relative, found = _relative(around, index)
+            relative, is_neighbor = _relative(around, index)
             features = _gathered(F.pad(around.features, (0, 0, 0, 1)), index)
             share = torch.tanh(self.offset(torch.cat([relative, features], dim=2)))
-            mean = (share * relative).sum(dim=1) / found.sum(dim=1).clamp(min=1)[:, None]
+            mean = (share * relative).sum(dim=1) / is_neighbor.sum(dim=1).clamp(min=1)[:, None]
             shifted.append(around.keypoints + mean)
         return shifted
 
@@ -184,9 +184,9 @@ def _gathered(rows: Tensor, index: Tensor) -> Tensor:
 
 def _relative(around: Surroundings, index: Tensor) -> tuple[Tensor, Tensor]:
     """Return v_j - v_i (K, T, 3), zeros for empty entries, and a mask of the others (K, T)."""
-    found = (index < around.positions.shape[0]).to(around.positions.dtype)
+    is_neighbor = (index < around.positions.shape[0]).to(around.positions.dtype)
     positions = _gathered(F.pad(around.positions, (0, 0, 0, 1)), index)
-    return (positions - around.keypoints[:, None]) * found[:, :, None], found
+    return (positions - around.keypoints[:, None]) * is_neighbor[:, :, None], is_neighbor
 
 
 _RESIDUAL_WEIGHT = 0.1  # epsilon of eq. (5)
@@ -274,15 +274,15 @@ class VoxelBackbone(nn.Module):
 
     def forward(self, features: Tensor, levels: Sequence[VoxelLevel[Tensor]]) -> list[Tensor]:
         """Encode voxel features (N, in_channels) -> (M, channels) of the active cells of every level."""
-        found = []
+        by_level = []
         for number, level in enumerate(levels):
             if number:
                 features = self.down[number - 1](features, level.strided, level.strided_back)
             if number < len(self.same):
                 for layer in self.same[number].children():
                     features = layer(features, level.same)
-            found.append(features)
-        return found
+            by_level.append(features)
+        return by_level
 
 
 POINT_CHANNELS = 4  # x, y, z, reflectance
@@ -367,23 +367,23 @@ class PvRcnn(nn.Module):
             for corner in range(batch.bev_cells.shape[1])
         )
         assert isinstance(bev, Tensor)
-        beside = bev if self.scales is None else torch.cat([self.scales(batch.points, batch.scales), bev], dim=1)
+        context = bev if self.scales is None else torch.cat([self.scales(batch.points, batch.scales), bev], dim=1)
         rows = [
             SourceRows(where, _source_features(each.source, batch.points, levels))
             for each, where in zip(self.settings.sources, batch.positions, strict=True)
         ]
         if not self.settings.deformed:
-            features, logits = self.encode(rows, batch.keypoints, beside, batch.ball_indices)
+            features, logits = self.encode(rows, batch.keypoints, context, batch.ball_indices)
             return features, logits
         places = self.deformed_positions(batch, levels)
         if self.settings.deform == "authors_frozen":
             places = {name: [place.detach() for place in each] for name, each in places.items()}
             rows = [
-                SourceRows(own.positions, own.features.detach()) if each.source in places else own
-                for each, own in zip(self.settings.sources, rows, strict=True)
+                SourceRows(given.positions, given.features.detach()) if each.source in places else given
+                for each, given in zip(self.settings.sources, rows, strict=True)
             ]
         indices, centers = deformed_balls(batch, self.settings, places)
-        features, logits = self.encode(rows, batch.keypoints, beside, indices, centers)
+        features, logits = self.encode(rows, batch.keypoints, context, indices, centers)
         return features, logits
 
     def deformed_positions(self, batch: VoxelBatch[Tensor], levels: Sequence[Tensor]) -> dict[str, list[Tensor]]:

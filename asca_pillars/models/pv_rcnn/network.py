@@ -32,7 +32,7 @@ class PvRcnnOutputs(NamedTuple):
 
     maps: HeadMaps[Tensor]
     """Head maps of the first stage."""
-    found: Refinements
+    refinements: Refinements
     """Refinements of `proposals` by the second stage."""
     proposals: tuple[Detections, ...]
     """Proposals of each frame: in training the sampled ones, otherwise all."""
@@ -74,19 +74,19 @@ class PvRcnnDetector(Trainable):
         first = self.network.propose(scans)
         proposals = self._proposals(first.maps, batch)
         with torch.autocast(first.canvas.device.type, enabled=False):  # positions need float32, `SetAbstraction`
-            found = self._refine(scans, first, proposals)
-        return PvRcnnOutputs(first.maps, found, proposals)
+            refinements = self._refine(scans, first, proposals)
+        return PvRcnnOutputs(first.maps, refinements, proposals)
 
     def loss(self, outputs: PvRcnnOutputs, batch: LabeledVoxels) -> Mapping[str, Tensor]:
         """Return loss terms of the trained parts by name, see `detection_loss` and `refine_loss`, all of weight 1."""
-        device = outputs.found.confidence.device
+        device = outputs.refinements.confidence.device
         first = {} if self._kept else detection_loss(outputs.maps, batch.anchors, self.loss_weights)._asdict()
         targets, loss_mask = _roi_targets(outputs.proposals, batch)
         counted = torch.from_numpy(loss_mask).to(device)
-        found = outputs.found
+        refinements = outputs.refinements
         confidence, positive, residuals, sizes = (torch.from_numpy(part[loss_mask]).to(device) for part in targets)
         targets_in_loss = RefineTargets(confidence, positive, residuals, sizes, batch.keypoint_states)
-        kept = Refinements(found.confidence[counted], found.residuals[counted], found.keypoint_logits)
+        kept = Refinements(refinements.confidence[counted], refinements.residuals[counted], refinements.keypoint_logits)
         terms = first | refine_loss(kept, targets_in_loss)._asdict()
         if self.model.box_loss == "va":
             boxes = (kept.residuals[positive].float(), residuals[positive], sizes[positive])
@@ -96,7 +96,7 @@ class PvRcnnDetector(Trainable):
 
     def detect(self, outputs: PvRcnnOutputs, spec: DetectorSpec) -> list[Detections]:
         """Return refined boxes of each frame, with the thresholds of `spec`."""
-        confidence, residuals = (part.float().cpu().numpy() for part in outputs.found[:2])
+        confidence, residuals = (part.float().cpu().numpy() for part in outputs.refinements[:2])
         return reported_frames(outputs.proposals, confidence, residuals, spec, self.model.scores)
 
     def _proposals(self, maps: HeadMaps[Tensor], batch: LabeledVoxels) -> tuple[Detections, ...]:
@@ -121,10 +121,10 @@ class PvRcnnDetector(Trainable):
     ) -> Detections:
         if not keypoints:  # nothing to see, and nothing to judge proposals by
             return Detections.empty(self.model.spec.class_names)
-        found = propose_anchors(maps, self.model.spec, settings)
+        proposals = propose_anchors(maps, self.model.spec, settings)
         if rng is None:
-            return found
-        return found[sample_rois(match_proposals(found, boxes, labels), self.model.rois, rng)]
+            return proposals
+        return proposals[sample_rois(match_proposals(proposals, boxes, labels), self.model.rois, rng)]
 
     def _refine(
         self, scans: VoxelBatch[Tensor], first: FirstStageOutputs, proposals: Sequence[Detections]
@@ -156,12 +156,12 @@ class PvRcnnDetector(Trainable):
         height, width, anchors, _ = self.model.spec.anchors.shape
         classes = len(self.model.spec.classes)
         maps = (nothing.new_zeros(frames, anchors * size, height, width) + nothing for size in (classes, 7, 2))
-        found = Refinements(
+        refinements = Refinements(
             nothing.new_zeros(0) + nothing,
             nothing.new_zeros(0, 7) + nothing,
             nothing.new_zeros(len(scans.keypoints)) + nothing,
         )
-        return PvRcnnOutputs(HeadMaps(*maps), found, (Detections.empty(self.model.spec.class_names),) * frames)
+        return PvRcnnOutputs(HeadMaps(*maps), refinements, (Detections.empty(self.model.spec.class_names),) * frames)
 
 
 def _roi_targets(

@@ -120,7 +120,7 @@ def deformed_balls(
     indices, centers, given = [], [], iter(batch.ball_indices)
     for number, each in enumerate(settings.sources):
         for radius, (radius_m, samples) in enumerate(zip(each.radii_m, each.samples, strict=True)):
-            here = next(given)
+            ball_indices = next(given)
             where = places.get(each.source, [batch.keypoints])
             center = where[min(radius, len(where) - 1)]
             if each.source in places:
@@ -129,9 +129,9 @@ def deformed_balls(
                     np.split(center.detach().cpu().numpy(), np.cumsum(batch.frame_keypoints)[:-1]),
                     strict=True,
                 )
-                found = [ball_query(rows, queries, radius_m, samples) for rows, queries in frames]
-                here = torch.from_numpy(stack_rows(found, batch.frame_rows[number])).to(center.device)
-            indices.append(here)
+                balls = [ball_query(rows, queries, radius_m, samples) for rows, queries in frames]
+                ball_indices = torch.from_numpy(stack_rows(balls, batch.frame_rows[number])).to(center.device)
+            indices.append(ball_indices)
             centers.append(center)
     return indices, centers
 

@@ -67,8 +67,8 @@ class SetAbstraction(nn.Module):
         first: Tensor = self.layers[0].weight  # type: ignore[assignment]  # (widths[0], 3 + C)
         points = F.linear(torch.cat([positions, features], dim=1), first)  # (N, widths[0])
         points = F.pad(points, (0, 0, 0, 1))  # row N
-        found = (indices[:, :1] < positions.shape[0]).to(points.dtype)
-        centers = F.linear(queries, first[:, :3]) * found  # (Q, widths[0])
+        is_neighbor = (indices[:, :1] < positions.shape[0]).to(points.dtype)
+        centers = F.linear(queries, first[:, :3]) * is_neighbor  # (Q, widths[0])
         grouped = points.index_select(0, indices.reshape(-1)).unflatten(0, indices.shape) - centers[:, None]
         return self.after_first(grouped.flatten(0, 1)).unflatten(0, indices.shape)
 
@@ -142,11 +142,11 @@ class VectorPool(nn.Module):
     @staticmethod
     def _cell(place: Tensor, of_points: Tensor, padded: Tensor, centers: Tensor, index: Tensor) -> Tensor:
         """Return [a_i - v_t ; h_t] W_t of one cell, (Q, cell_channels)."""
-        found = (index < padded.shape[0] - 1).to(padded.dtype)  # (Q, 3)
+        is_neighbor = (index < padded.shape[0] - 1).to(padded.dtype)  # (Q, 3)
         near = padded.index_select(0, index.reshape(-1)).unflatten(0, index.shape)
-        away = (near - centers[:, None]) * found[..., None]  # a_i - v_t
+        away = (near - centers[:, None]) * is_neighbor[..., None]  # a_i - v_t
         # Not `+`: onnxscript takes so small an addition for none.
-        shares = found / away.square().sum(dim=2).sqrt().clamp(min=_LEAST_DISTANCE_M)
+        shares = is_neighbor / away.square().sum(dim=2).sqrt().clamp(min=_LEAST_DISTANCE_M)
         shares = shares / shares.sum(dim=1, keepdim=True).clamp(min=_LEAST_DISTANCE_M)
         rows = of_points.index_select(0, index.reshape(-1)).unflatten(0, index.shape)  # (Q, 3, cell_channels)
         return away.flatten(1) @ place + (rows * shares[..., None]).sum(dim=1)
@@ -233,15 +233,15 @@ class KeypointEncoder(nn.Module):
             indices: (K, T) rows of the source, source by source and radius by radius.
             centers: (K, 3) of these balls; None where all are the keypoints.
         """
-        found, balls = [], iter(zip(self.balls, indices, centers or [keypoints] * len(indices), strict=True))
-        for number, (own, source) in enumerate(zip(rows, self.sources, strict=True)):
+        by_source, balls = [], iter(zip(self.balls, indices, centers or [keypoints] * len(indices), strict=True))
+        for number, (source_rows, source) in enumerate(zip(rows, self.sources, strict=True)):
             of_radii = [
-                ball(own.positions, own.features, center, index)
+                ball(source_rows.positions, source_rows.features, center, index)
                 for ball, index, center in itertools.islice(balls, source.radii)
             ]
             features = torch.cat(of_radii, dim=1)
-            found.append(self.gates[str(number)](features) if source.gated else features)
-        joined = torch.cat([*found, bev], dim=1)
+            by_source.append(self.gates[str(number)](features) if source.gated else features)
+        joined = torch.cat([*by_source, bev], dim=1)
         logits = self.weigh(joined)
         return self.fuse(joined) * torch.sigmoid(logits), logits[:, 0]
 

@@ -46,15 +46,15 @@ class RefineTerms(NamedTuple):
         return self.confidence + self.residuals + self.corners + self.keypoints
 
 
-def refine_loss(found: Refinements, targets: RefineTargets) -> RefineTerms:
+def refine_loss(refinements: Refinements, targets: RefineTargets) -> RefineTerms:
     """Compute BCE per proposal, smooth L1 and corners per positive proposal, focal loss per positive keypoint."""
-    confidence = F.binary_cross_entropy_with_logits(found.confidence.float(), targets.confidence, reduction="sum")
+    confidence = F.binary_cross_entropy_with_logits(refinements.confidence.float(), targets.confidence, reduction="sum")
     positive = targets.positive
-    residuals, target = found.residuals.float()[positive], targets.residuals[positive]
+    residuals, target = refinements.residuals.float()[positive], targets.residuals[positive]
     positives = max(len(target), 1)
     corners = corner_loss(residuals, target, targets.sizes[positive])
     states = targets.keypoint_states
-    keypoints = focal_loss(found.keypoint_logits.float(), states, _FOCAL_ALPHA, _FOCAL_GAMMA)
+    keypoints = focal_loss(refinements.keypoint_logits.float(), states, _FOCAL_ALPHA, _FOCAL_GAMMA)
     in_objects = max(int((states == 1).sum()), round(_LEAST_POSITIVE * len(states)), 1)
     return RefineTerms(
         confidence / max(len(positive), 1),
@@ -70,11 +70,11 @@ def corner_loss(residuals: Tensor, targets: Tensor, sizes: Tensor) -> Tensor:
     Corners are in the frames of the proposals, which have these sizes. Each is compared with the nearer one of the
     target box and of the same box turned by half a circle.
     """
-    found, target = corners_in_frames(residuals, sizes), corners_in_frames(targets, sizes)
+    predicted, target = corners_in_frames(residuals, sizes), corners_in_frames(targets, sizes)
     half_turn = torch.zeros_like(targets)
     half_turn[:, 6] = math.pi
     turned = corners_in_frames(targets + half_turn, sizes)
-    way_m = torch.minimum((found - target).norm(dim=2), (found - turned).norm(dim=2))  # (R, 8)
+    way_m = torch.minimum((predicted - target).norm(dim=2), (predicted - turned).norm(dim=2))  # (R, 8)
     return F.smooth_l1_loss(way_m, torch.zeros_like(way_m), beta=_CORNER_BETA, reduction="none").mean(dim=1)
 
 

@@ -42,7 +42,7 @@ POINT_CHANNELS = 1  # reflectance
 class RefineOutputs(NamedTuple):
     """Outputs of the second stage for the proposals of B frames."""
 
-    found: Refinements
+    refinements: Refinements
     proposals: tuple[Detections, ...]
     """Proposals of each frame, which `found` refines."""
 
@@ -76,13 +76,15 @@ class RefineDetector(Trainable):
         if self.training and rows < 2:  # no statistics of a batch, and nothing to learn
             return RefineOutputs(self._zero_outputs(inputs), batch.proposals)
         with torch.autocast(inputs.points.device.type, enabled=False):  # positions need float32, `SetAbstraction`
-            found: Refinements = self.refiner(inputs)
-        return RefineOutputs(found, batch.proposals)
+            refinements: Refinements = self.refiner(inputs)
+        return RefineOutputs(refinements, batch.proposals)
 
     def loss(self, outputs: RefineOutputs, batch: LabeledProposals) -> Mapping[str, Tensor]:
         """Return the terms by name, see `refine_loss`; proposals of IGNORED boxes are left out."""
-        found, targets, loss_mask = outputs.found, batch.targets, batch.loss_mask
-        counted = Refinements(found.confidence[loss_mask], found.residuals[loss_mask], found.keypoint_logits)
+        refinements, targets, loss_mask = outputs.refinements, batch.targets, batch.loss_mask
+        counted = Refinements(
+            refinements.confidence[loss_mask], refinements.residuals[loss_mask], refinements.keypoint_logits
+        )
         targets_in_loss = RefineTargets(
             targets.confidence[loss_mask],
             targets.positive[loss_mask],
@@ -94,7 +96,7 @@ class RefineDetector(Trainable):
 
     def detect(self, outputs: RefineOutputs, spec: DetectorSpec) -> list[Detections]:
         """Return refined boxes of each frame, with the thresholds of `spec`."""
-        confidence, residuals = (part.float().cpu().numpy() for part in outputs.found[:2])
+        confidence, residuals = (part.float().cpu().numpy() for part in outputs.refinements[:2])
         return reported_frames(outputs.proposals, confidence, residuals, spec, self.model.refine.scores)
 
     def _zero_outputs(self, inputs: RefineInputs) -> Refinements:
@@ -167,5 +169,5 @@ def refine_logits(
         return np.empty(0, np.float32), np.empty((0, 7), np.float32)
     inputs = collate_scans([refine_scan(points, proposed, proposed.proposals, settings)])
     with torch.inference_mode():
-        found = network(inputs)
-    return found.confidence.numpy(), found.residuals.numpy()
+        refinements = network(inputs)
+    return refinements.confidence.numpy(), refinements.residuals.numpy()

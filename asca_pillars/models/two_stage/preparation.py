@@ -128,9 +128,9 @@ def _propose(
 ) -> None:
     stamp = _stamp(split, frame_id)  # before the scan is read: one that changes meanwhile is read again
     points = split.points(frame_id, camera_view=camera_view)
-    found = run_first_stage(stage, points[np.isfinite(points).all(axis=1)], settings)
+    stage_inputs = run_first_stage(stage, points[np.isfinite(points).all(axis=1)], settings)
     with writable_atomic_path(files.path(frame_id)) as temporary, temporary.open("wb") as file:
-        np.savez(file, allow_pickle=False, stamp=stamp, **_arrays(found))
+        np.savez(file, allow_pickle=False, stamp=stamp, **_arrays(stage_inputs))
 
 
 def _stamp(split: LabeledSplit, frame_id: str) -> NDArray[np.int64]:
@@ -141,14 +141,14 @@ def _stamp(split: LabeledSplit, frame_id: str) -> NDArray[np.int64]:
         return np.zeros(0, np.int64)
 
 
-def _arrays(found: SecondStageInputs) -> dict[str, NDArray[np.generic]]:
-    proposals = found.proposals
+def _arrays(stage_inputs: SecondStageInputs) -> dict[str, NDArray[np.generic]]:
+    proposals = stage_inputs.proposals
     return {
         "boxes": proposals.boxes,
         "scores": proposals.scores,
         "labels": proposals.labels,
-        "keypoints": found.keypoints,
-        "bev": found.bev.astype(np.float16),  # the bulk of the file, and more digits than a feature is worth
+        "keypoints": stage_inputs.keypoints,
+        "bev": stage_inputs.bev.astype(np.float16),  # the bulk of the file, and more digits than a feature is worth
     }
 
 

@@ -287,15 +287,15 @@ def pool_pillars(
 
     Steps of a quantized graph may be pooled as well: their order is that of the values.
     """
-    found = map_cells(cells, grid)
-    if found is None:
+    mapped = map_cells(cells, grid)
+    if mapped is None:
         return features, cells
-    starts = np.cumsum(found.counts) - found.counts
-    pooled = features[found.pillars[starts]]
-    for further in range(1, int(found.counts.max(initial=1))):
-        shared = np.flatnonzero(found.counts > further)
-        pooled[shared] = np.maximum(pooled[shared], features[found.pillars[starts[shared] + further]])
-    return pooled, found.cells
+    starts = np.cumsum(mapped.counts) - mapped.counts
+    pooled = features[mapped.pillars[starts]]
+    for further in range(1, int(mapped.counts.max(initial=1))):
+        shared = np.flatnonzero(mapped.counts > further)
+        pooled[shared] = np.maximum(pooled[shared], features[mapped.pillars[starts[shared] + further]])
+    return pooled, mapped.cells
 
 
 NECK_STRIDE = 8  # stride of the coarsest map in the paper's Table 1

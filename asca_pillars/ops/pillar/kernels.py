@@ -27,8 +27,8 @@ def sort_points(points: _Floats, grid: PillarGrid) -> tuple[_Counts, _Integers, 
     memory = np.empty(5 * len(points) + size, np.uint32)
     tally, rows = memory[:size], memory[size:].reshape(5, len(points))
     order, cells, counts = rows[2:]
-    inside, found = _sort_points(points, *grid.tables, tally, *rows)
-    return order[:inside], cells[:found].astype(np.int64), counts[:found].astype(np.int64)
+    inside, pillars = _sort_points(points, *grid.tables, tally, *rows)
+    return order[:inside], cells[:pillars].astype(np.int64), counts[:pillars].astype(np.int64)
 
 
 @inner
@@ -71,14 +71,14 @@ def _sort_points(
     slices_per_m = np.float32(len(slice_edges_m) - 1) / (slice_edges_m[-1] - slice_edges_m[0])
     rows_per_m = np.float32(len(row_edges_m) - 1) / (row_edges_m[-1] - row_edges_m[0])
     columns = np.uint64(column_of_slice[-1] + 1)
-    found = 0
+    pillars = 0
     tally[:] = 0
     for k in range(inside):
         x, y = points[chosen[k], 0], points[chosen[k], 1]
         column = np.uint64(column_of_slice[_interval(x, slice_edges_m, slices_per_m)])
         cell = _interval(y, row_edges_m, rows_per_m) * columns + column
         cell_of_chosen[k] = cell
-        found += tally[cell] == 0
+        pillars += tally[cell] == 0
         tally[cell] += 1
 
     pillar = position = 0
@@ -100,7 +100,7 @@ def _sort_points(
         cell = cell_of_chosen[k]
         order[tally[cell]] = chosen[k]
         tally[cell] += 1
-    return inside, found
+    return inside, pillars
 
 
 def fill_pillars(

@@ -29,13 +29,13 @@ def ball_query(
     share: int,
 ) -> _Integers:
     """Compute `numpy_kernels._ball_query`, query by query: metres (N, 3), (Q, 3) -> indices (Q, samples)."""
-    found, sorted_xyz = np.empty((len(centers), samples), np.int32), np.empty((len(xyz), 3), np.float32)
+    indices, sorted_xyz = np.empty((len(centers), samples), np.int32), np.empty((len(xyz), 3), np.float32)
     at = centers, cells_of(centers, columns)
     widths = np.zeros(2 * int(offsets.max()) + 1, np.int32)
     np.maximum.at(widths, offsets[:, 0] - offsets.min(), offsets[:, 1])
     ball = offsets, widths, squared_radius, share
-    _ball_query(xyz, columns.order, columns.starts, *columns.shape, *at, *ball, sorted_xyz, found)
-    return found
+    _ball_query(xyz, columns.order, columns.starts, *columns.shape, *at, *ball, sorted_xyz, indices)
+    return indices
 
 
 def three_nearest(xyz: _Floats, centers: _Floats, columns: Columns) -> tuple[_Integers, _Floats]:
@@ -91,13 +91,13 @@ def _ball_query(
     squared_radius: float,
     share: int,
     sorted_xyz: _Floats,
-    found: _Integers,
+    indices: _Integers,
 ) -> None:
     """Kernel of `ball_query`; `widths`: for each row of `offsets`, how many columns a ball reaches to either side."""
     for k in range(len(order)):
         for axis in range(3):
             sorted_xyz[k, axis] = xyz[order[k], axis]
-    samples, reach = found.shape[1], len(widths) // 2
+    samples, reach = indices.shape[1], len(widths) // 2
     for query in range(len(centers)):
         x, y, z = centers[query, 0], centers[query, 1], centers[query, 2]
         row, column = cells[query, 0], cells[query, 1]
@@ -114,7 +114,7 @@ def _ball_query(
                 break
             for k in range(run, run_end):
                 dx, dy, dz = sorted_xyz[k, 0] - x, sorted_xyz[k, 1] - y, sorted_xyz[k, 2] - z
-                found[query, min(count, samples - 1)] = order[k]  # stays if it is inside
+                indices[query, min(count, samples - 1)] = order[k]  # stays if it is inside
                 count += dx * dx + dy * dy + dz * dz < squared_radius
         begin, end, more = 0, share, seen > _CROWDED * samples or count >= samples
         if more:
@@ -134,7 +134,7 @@ def _ball_query(
                             more = True
                             break
                         if inside > begin:
-                            found[query, count] = order[k]
+                            indices[query, count] = order[k]
                             count += 1
                             if count == samples:
                                 break
@@ -144,13 +144,13 @@ def _ball_query(
         if count == samples:
             continue
         for place in range(1, count):
-            moved, other = found[query, place], place
-            while other and found[query, other - 1] > moved:
-                found[query, other] = found[query, other - 1]
+            moved, other = indices[query, place], place
+            while other and indices[query, other - 1] > moved:
+                indices[query, other] = indices[query, other - 1]
                 other -= 1
-            found[query, other] = moved
+            indices[query, other] = moved
         for rest in range(count, samples):
-            found[query, rest] = found[query, 0] if count else len(xyz)
+            indices[query, rest] = indices[query, 0] if count else len(xyz)
 
 
 @inner
@@ -187,7 +187,7 @@ def _three_nearest(
     for query in range(len(centers)):
         x, y, z = centers[query, 0], centers[query, 1], centers[query, 2]
         row, column = min(max(cells[query, 0], 0), ny - 1), min(max(cells[query, 1], 0), nx - 1)
-        found, away = (none, none, none), (infinity, infinity, infinity)
+        indices, away = (none, none, none), (infinity, infinity, infinity)
         for ring in range(max(nx, ny)):
             # Points outside `ring - 1` rings are at least that many columns away, within rounding.
             clear = max(ring - np.float32(1.01), np.float32(0)) / per_m
@@ -202,9 +202,9 @@ def _three_nearest(
                     for k in range(starts[cell], starts[cell + 1]):
                         i = np.int64(order[k])
                         dx, dy, dz = xyz[i, 0] - x, xyz[i, 1] - y, xyz[i, 2] - z
-                        found, away = _kept(i, dx * dx + dy * dy + dz * dz, found, away)
+                        indices, away = _kept(i, dx * dx + dy * dy + dz * dz, indices, away)
         for rank in range(3):
-            nearest[query, rank], squared[query, rank] = found[rank], away[rank]
+            nearest[query, rank], squared[query, rank] = indices[rank], away[rank]
 
 
 @compiled(
@@ -244,10 +244,10 @@ def _nearest_in_cubes(
                         count += 1
         for cell in range(len(offsets)):
             at_x, at_y, at_z = x + offsets[cell, 0], y + offsets[cell, 1], z + offsets[cell, 2]
-            found, away = (none, none, none), (infinity, infinity, infinity)
+            indices, away = (none, none, none), (infinity, infinity, infinity)
             for k in range(count):
                 i = np.int64(room[k])
                 dx, dy, dz = xyz[i, 0] - at_x, xyz[i, 1] - at_y, xyz[i, 2] - at_z
-                found, away = _kept(i, dx * dx + dy * dy + dz * dz, found, away)
+                indices, away = _kept(i, dx * dx + dy * dy + dz * dz, indices, away)
             for rank in range(3):
-                nearest[query, cell, rank] = found[rank]
+                nearest[query, cell, rank] = indices[rank]

@@ -64,8 +64,8 @@ def three_nearest(points: NDArray[Any], queries: NDArray[Any]) -> tuple[NDArray[
     xyz, centers = require_points(points), require_points(queries)
     column_m = math.sqrt(_area_m2(xyz) / max(len(xyz), 1)) + 1e-3  # about one point in each
     nearest, squared = load_kernels(KERNELS).three_nearest(xyz, centers, sort_into_columns(xyz, column_m))
-    found = nearest < len(xyz)
-    weights = np.where(found, 1 / (np.sqrt(squared) + np.float32(1e-8)), np.float32(0))
+    exists = nearest < len(xyz)
+    weights = np.where(exists, 1 / (np.sqrt(squared) + np.float32(1e-8)), np.float32(0))
     total = weights.sum(axis=1, keepdims=True)
     return nearest, np.divide(weights, total, out=np.zeros_like(weights), where=total > 0)
 
@@ -221,7 +221,11 @@ def group_balls(indices: NDArray[np.int32], count: int) -> GroupedBalls[NDArray[
     queries = np.where(balls[:, 0] < count, order, np.int32(len(order)))
     groups = zip(np.split(queries, ends), np.split(balls, ends), widths, strict=True)
     return GroupedBalls(
-        tuple(BallGroup(own, np.ascontiguousarray(ball[:, :width])) for own, ball, width in groups), rows
+        tuple(
+            BallGroup(centers_of_group, np.ascontiguousarray(ball[:, :width]))
+            for centers_of_group, ball, width in groups
+        ),
+        rows,
     )
 
 

@@ -41,12 +41,12 @@ def farthest_points(xyz: _Floats, count: int, columns: Columns) -> _Integers:
     """Sample the farthest points by columns: (N, 3) in metres -> indices (S,), S at most `count`."""
     cells = len(columns.starts) - 1
     chosen = np.empty(min(count, len(xyz)), np.int32)
-    found = _farthest_points(
+    sampled = _farthest_points(
         *(xyz, *_flat(columns)),
         *(np.empty((4, len(xyz)), np.float32), np.empty((cells, 6), np.float32), np.empty(cells, np.float32)),
         *(np.empty(cells, np.int32), np.empty(columns.shape[0], np.int32), chosen),
     )
-    return chosen[:found]
+    return chosen[:sampled]
 
 
 def near_circles(points: _Floats, centers: _Floats, squared: _Floats) -> _Floats:
@@ -157,15 +157,15 @@ def _farthest_points(
             boxes[cell, 2], boxes[cell, 5] = min(boxes[cell, 2], zs[k]), max(boxes[cell, 5], zs[k])
     chosen[0] = 0
     farthest = np.float32(np.inf)
-    for found in range(1, len(chosen)):
-        last = chosen[found - 1]
+    for sampled in range(1, len(chosen)):
+        last = chosen[sampled - 1]
         x, y, z = xyz[last, 0], xyz[last, 1], xyz[last, 2]
         # No point is farther from its sample than `farthest`, so none that stands farther off can change.
         reach = np.float32(1.001) * math.sqrt(farthest) + np.float32(0.001) * (abs(x) + abs(y) + 1)
         first_row, last_row = max(_column(y - reach, y_low, per_m), 0), min(_column(y + reach, y_low, per_m), ny - 1)
         first, end = max(_column(x - reach, x_low, per_m), 0), min(_column(x + reach, x_low, per_m), nx - 1) + 1
         for row in range(first_row, last_row + 1):
-            changed = found == 1
+            changed = sampled == 1
             for cell in range(row * nx + first, row * nx + end):
                 dx = max(boxes[cell, 0] - x, x - boxes[cell, 3], np.float32(0))
                 dy = max(boxes[cell, 1] - y, y - boxes[cell, 4], np.float32(0))
@@ -196,8 +196,8 @@ def _farthest_points(
                 top = cell
         farthest = largest[top]
         if farthest == 0:
-            return found
-        chosen[found] = order[best[top]]
+            return sampled
+        chosen[sampled] = order[best[top]]
     return len(chosen)
 
 

@@ -75,7 +75,7 @@ def _mark(mask: _Masks, start: _Rows, column: np.uint64, bits: np.uint64) -> Any
 def _mark_flat(cells: _Integers, y_links: _Integers, x_links: _Integers, taps: int, nx: int, start: _Rows) -> Any:
     """Compute `mark_joined` where both lattices are one cell high and the kernel is square, several times as fast."""
     nowhere, width = np.uint64(len(start) - 1), len(x_links)
-    row, found = 0, np.int64(0)
+    row, marked = 0, np.int64(0)
     start[nowhere] = 0
     for i in range(len(cells)):
         while cells[i] >= (row + 1) * width:
@@ -89,21 +89,21 @@ def _mark_flat(cells: _Integers, y_links: _Integers, x_links: _Integers, taps: i
                 # Without branches: what is joined and new is hard to predict.
                 x = x_of[np.uint64(kx)]
                 place = np.uint64(y * nx + x) if x >= 0 else nowhere
-                found -= start[place]
+                marked -= start[place]
                 start[place] = 0
     start[nowhere] = -1
-    return found
+    return marked
 
 
 @compiled(_CELLS, types.int64, out_array(types.uint64), out_array(types.int32))
 def mark_points(cells: _Integers, nz: int, mask: _Masks, start: _Rows) -> int:
     """Set the bits of the points' cells, flat indices (M,) or -1, and return how many were not set before."""
-    found = 0
+    marked = 0
     for i in range(len(cells)):
         if cells[i] >= 0:
             column = cells[i] // nz
-            found += _mark(mask, start, np.uint64(column), _ONE << np.uint64(cells[i] - column * nz))
-    return found
+            marked += _mark(mask, start, np.uint64(column), _ONE << np.uint64(cells[i] - column * nz))
+    return marked
 
 
 @compiled(_CELLS, *_LINKS, types.int64, out_array(types.uint64), out_array(types.int32))
@@ -126,7 +126,7 @@ def mark_joined(
         if taps == 3:  # a number that the compiler knows
             return _mark_flat(cells, y_links, x_links, 3, nx, start)
         return _mark_flat(cells, y_links, x_links, taps, nx, start)
-    found = i = row = 0
+    marked = i = row = 0
     while i < len(cells):
         column = cells[i] // depth if depth > 1 else cells[i]
         bits = np.uint64(0)
@@ -146,8 +146,8 @@ def mark_joined(
             for kx in range(len(x_of)):
                 x = x_of[np.uint64(kx)]
                 if x >= 0:
-                    found += _mark(mask, start, np.uint64(y * nx + x), bits)
-    return found
+                    marked += _mark(mask, start, np.uint64(y * nx + x), bits)
+    return marked
 
 
 @compiled(in_array(types.uint64), out_array(types.int32), types.int64, out_array(types.int64))

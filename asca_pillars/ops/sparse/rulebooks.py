@@ -154,10 +154,10 @@ class CellMap:
     def activate_joined(self, sources: Sequence[tuple["CellMap", AxisKernelMaps]]) -> None:
         """Activate the cells that any tap joins with an active cell of a source; this map must not be a source."""
         self._kernels.clear_columns(self.cells, self.shape[0], *self.columns)
-        found = 0
+        active = 0
         for source, kernel_maps in sources:
-            found += self._kernels.mark_joined(source.cells, *kernel_maps, self.shape[2], *self.columns)
-        self._list_cells(found)
+            active += self._kernels.mark_joined(source.cells, *kernel_maps, self.shape[2], *self.columns)
+        self._list_cells(active)
 
     def _list_cells(self, count: int) -> None:
         """Activate the cells that the kernels have marked, of this number."""

@@ -128,10 +128,10 @@ class RoiTargets:
 def match_proposals(proposals: Detections, boxes: NDArray[np.float32], labels: NDArray[np.int64]) -> Overlaps:
     """Match proposals with labelled boxes (N, 7), LiDAR frame, of classes (N,) or IGNORED, by 3D IoU."""
     iou = iou_3d(proposals.boxes, boxes)
-    own = np.where(proposals.labels[:, None] == labels[None], iou, 0.0)
+    same_class_iou = np.where(proposals.labels[:, None] == labels[None], iou, 0.0)
     other = np.where(labels[None] == IGNORED, iou, 0.0).max(axis=1, initial=0.0)
-    best = own.max(axis=1, initial=0.0)
-    matched = np.where(best > 0, own.argmax(axis=1) if len(boxes) else -1, -1)
+    best = same_class_iou.max(axis=1, initial=0.0)
+    matched = np.where(best > 0, same_class_iou.argmax(axis=1) if len(boxes) else -1, -1)
     return Overlaps(best, matched, (other > best) & (other >= HARD_IOU))
 
 
@@ -161,14 +161,14 @@ def roi_targets(
     low, high = _CONFIDENCE_IOU
     iou = overlaps.iou[rois]
     positive = iou > FOREGROUND_IOU
-    own = proposals.boxes[rois]
-    target_boxes = own.copy()
+    roi_boxes = proposals.boxes[rois]
+    target_boxes = roi_boxes.copy()
     target_boxes[positive] = boxes[overlaps.matched[rois[positive]]]
     return RoiTargets(
         rois=rois,
         confidence=np.clip((iou - low) / (high - low), 0, 1).astype(np.float32),
         positive=positive,
-        residuals=encode_refinement(target_boxes, own),
+        residuals=encode_refinement(target_boxes, roi_boxes),
         boxes=target_boxes,
     )
 
@@ -191,8 +191,8 @@ Scores = Literal["second", "both"]
 
 def refined_scores(proposals: Detections, confidence: NDArray[np.float32], scores: Scores) -> NDArray[np.float32]:
     """Return scores (R,) in [0, 1] of refined boxes, from the second stage's confidence (R,), logits."""
-    own = sigmoid(confidence)
-    return own if scores == "second" else np.sqrt(own * proposals.scores)
+    refined = sigmoid(confidence)
+    return refined if scores == "second" else np.sqrt(refined * proposals.scores)
 
 
 def reported_detections(
@@ -216,8 +216,8 @@ def reported_detections(
     values = refined_scores(proposals, np.where(finite, confidence, np.float32(0)), scores)
     thresholds = np.array([item.score_threshold for item in spec.classes])
     kept = np.flatnonzero(finite & (values >= thresholds[proposals.labels]))
-    found = refined_detections(proposals[kept], values[kept], residuals[kept], spec.post)
-    return replace(found, non_finite=proposals.non_finite + int((~finite).sum()) + found.non_finite)
+    detections = refined_detections(proposals[kept], values[kept], residuals[kept], spec.post)
+    return replace(detections, non_finite=proposals.non_finite + int((~finite).sum()) + detections.non_finite)
 
 
 def reported_frames(
@@ -246,8 +246,8 @@ def refined_detections(
     with np.errstate(over="ignore", invalid="ignore"):  # non-finite values are left out below
         boxes = decode_refinement(residuals, proposals.boxes)
     usable = np.isfinite(boxes).all(axis=1) & np.isfinite(scores)
-    own = np.flatnonzero(usable)
-    survivors = own[nms_by_class(boxes[own], scores[own], proposals.labels[own], post.nms_iou, post.max_detections)]
+    rows = np.flatnonzero(usable)
+    survivors = rows[nms_by_class(boxes[rows], scores[rows], proposals.labels[rows], post.nms_iou, post.max_detections)]
     best = survivors[np.argsort(-scores[survivors], kind="stable")[: post.max_detections]]
-    found = Detections(boxes[best], scores[best].astype(np.float32), proposals.labels[best], proposals.class_names)
-    return replace(found, non_finite=int((~usable).sum()))
+    detections = Detections(boxes[best], scores[best].astype(np.float32), proposals.labels[best], proposals.class_names)
+    return replace(detections, non_finite=int((~usable).sum()))

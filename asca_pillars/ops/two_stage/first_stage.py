@@ -108,24 +108,24 @@ def run_first_stage(stage: FirstStage, points: NDArray[np.float32], settings: Fi
 
 
 def second_stage_inputs(
-    found: FirstStageOutputs, points: NDArray[np.float32], spec: DetectorSpec, settings: FirstStageSettings
+    outputs: FirstStageOutputs, points: NDArray[np.float32], spec: DetectorSpec, settings: FirstStageSettings
 ) -> SecondStageInputs:
-    """Return the second stage's input from the first stage's outputs `found` for finite points (N, 4) of one scan."""
-    proposals = propose(found.maps, spec, settings.proposals, found.cells)
+    """Return the second stage's input from the first stage's outputs `outputs` for finite points (N, 4) of one scan."""
+    proposals = propose(outputs.maps, spec, settings.proposals, outputs.cells)
     near = points_near_boxes(points, proposals.boxes, settings.keypoints.margin_m)
     keypoints = np.ascontiguousarray(near[farthest_points(near, settings.keypoints.count), :3])
-    return SecondStageInputs(proposals, keypoints, _read_neck(found, keypoints, spec))
+    return SecondStageInputs(proposals, keypoints, _read_neck(outputs, keypoints, spec))
 
 
-def _read_neck(found: FirstStageOutputs, keypoints: NDArray[np.float32], spec: DetectorSpec) -> NDArray[np.float32]:
+def _read_neck(outputs: FirstStageOutputs, keypoints: NDArray[np.float32], spec: DetectorSpec) -> NDArray[np.float32]:
     x_m, y_m = spec.head_centers_m()
     cells, weights = bilinear_cells(keypoints, x_m, y_m)
-    rows = found.neck.reshape(-1, found.neck.shape[-1])
-    if found.cells is not None:
+    rows = outputs.neck.reshape(-1, outputs.neck.shape[-1])
+    if outputs.cells is not None:
         if not len(rows):
             return np.zeros((len(keypoints), rows.shape[1]), np.float32)
         row_of_cell = np.full(len(x_m) * len(y_m), -1, np.int32)
-        row_of_cell[found.cells] = np.arange(len(rows))
+        row_of_cell[outputs.cells] = np.arange(len(rows))
         cells = row_of_cell[cells]
         weights, cells = np.where(cells < 0, np.float32(0), weights), np.maximum(cells, 0)
     return read_map(rows, cells, weights)

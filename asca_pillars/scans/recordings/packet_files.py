@@ -195,13 +195,13 @@ def velodyne_scan(message: Message) -> tuple[Any, StoredPoints]:
 def _metadata_beside(path: Path) -> Path:
     """Return the `.json` with the longest name that equals or begins the capture's name."""
     name = path.name.partition(".pcap")[0]
-    beside = [one for one in visible_files(path.parent, "*.json") if name.startswith(one.stem)]
-    if not beside:
+    candidates = [one for one in visible_files(path.parent, "*.json") if name.startswith(one.stem)]
+    if not candidates:
         raise ScanError(
             f"{path}: holds no packets of a Velodyne, and for those of an Ouster the sensor's metadata must lie "
             f"beside it as {name}.json"
         )
-    return max(beside, key=lambda one: len(one.stem))
+    return max(candidates, key=lambda one: len(one.stem))
 
 
 def _packed(time_ns: int, points: NDArray[np.float32]) -> Message:

@@ -86,15 +86,15 @@ def open_recording(path: Path, reporter: Reporter = SILENT) -> Recording:
     return _open_file(files[0], reporter)
 
 
-def _open_rosbag2(folder: Path, there: list[Path], metadata: BagMetadata, reporter: Reporter) -> Recording:
+def _open_rosbag2(folder: Path, files: list[Path], metadata: BagMetadata, reporter: Reporter) -> Recording:
     """Open the listed files, or all if none of them is there; errors in some do not lose the others."""
-    by_name = {_unpacked_name(path.name): path for path in there}
+    by_name = {_unpacked_name(path.name): path for path in files}
     listed = {name: by_name.get(_unpacked_name(name)) for name in metadata.files}
     if packed := [name for name, file in listed.items() if file is None and (folder / name).is_file()]:
         raise ScanError(f"{folder}: {packed[0]} is packed, and {', '.join(UNPACKERS)} are read; unpack it there")
     troubles = [f"{folder}: {name} is missing" for name, file in listed.items() if file is None]
     if len(troubles) == len(listed):
-        troubles, listed = [], {file.name: file for file in there}
+        troubles, listed = [], {file.name: file for file in files}
     recordings = []
     for file in filter(None, listed.values()):
         try:
@@ -140,10 +140,10 @@ def _unpacked_name(name: str) -> str:
 
 def _files(folder: Path) -> list[Path]:
     """Return the rosbag2 files of a folder, in natural order; a decompressed copy replaces its compressed file."""
-    found = [file for suffix in _ROSBAG2_SUFFIXES for file in visible_files(folder, f"*{suffix}*")]
-    found = [file for file in found if _recorded_suffix(file) in _ROSBAG2_SUFFIXES and not file.is_dir()]
-    plain = {file.name for file in found if file.name == _unpacked_name(file.name)}
-    chosen = {file for file in found if file.name in plain or _unpacked_name(file.name) not in plain}
+    files = [file for suffix in _ROSBAG2_SUFFIXES for file in visible_files(folder, f"*{suffix}*")]
+    files = [file for file in files if _recorded_suffix(file) in _ROSBAG2_SUFFIXES and not file.is_dir()]
+    plain = {file.name for file in files if file.name == _unpacked_name(file.name)}
+    chosen = {file for file in files if file.name in plain or _unpacked_name(file.name) not in plain}
     return sorted(chosen, key=lambda file: natural_order(Path(file.name)))
 
 

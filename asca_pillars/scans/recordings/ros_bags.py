@@ -117,10 +117,10 @@ class SqliteRecording(Recording):
     @staticmethod
     def _data(database: "sqlite3.Connection", row: int) -> bytes:
         try:
-            found = database.execute("SELECT data FROM messages WHERE rowid = ?", (row,)).fetchone()
+            row_data = database.execute("SELECT data FROM messages WHERE rowid = ?", (row,)).fetchone()
         except Exception:  # damaged pages
             return b""
-        return found[0] if found is not None and isinstance(found[0], bytes) else b""
+        return row_data[0] if row_data is not None and isinstance(row_data[0], bytes) else b""
 
 
 def _text(content: bytes) -> str:

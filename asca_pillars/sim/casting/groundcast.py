@@ -289,13 +289,13 @@ def meeting(ray: GroundRay, way: Descent, street: Street, relief: Floats, z_m: f
         if reach - near < 0.004 or above <= 0.0 or left > -SAME_M:
             break
         middle = near + (reach - near) * above / (above - gap)
-        here = gap_at(ray, middle, street, relief, z_m)
-        if abs(here) < MET_M:
-            return middle, here
-        if here > 0.0:
-            near, above, gap = middle, here, 0.5 * gap
+        middle_gap = gap_at(ray, middle, street, relief, z_m)
+        if abs(middle_gap) < MET_M:
+            return middle, middle_gap
+        if middle_gap > 0.0:
+            near, above, gap = middle, middle_gap, 0.5 * gap
         else:
-            reach, gap, above, left = middle, here, 0.5 * above, here
+            reach, gap, above, left = middle, middle_gap, 0.5 * above, middle_gap
     return reach, left
 
 

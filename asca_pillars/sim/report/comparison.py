@@ -202,34 +202,34 @@ class Comparison:
 
 def compare(measured: Measured, real: Statistics) -> Comparison:
     """Return all rows for which both sides have the numbers."""
-    ours = measured.statistics
+    simulated = measured.statistics
     rows = [
-        *_scan_rows(real.scan, ours.scan),
-        *_car_rows(real.scan, ours.scan),
+        *_scan_rows(real.scan, simulated.scan),
+        *_car_rows(real.scan, simulated.scan),
         *_reflectance_rows(real.scan, measured),
-        *_band_rows(real.scan, ours.scan),
-        *_fit_rows(real, ours),
-        *(row for name in real.labels if name in ours.labels for row in _label_rows(name, real, ours)),
-        _ratio("labels", "DontCare per frame", real.dont_care_per_frame, ours.dont_care_per_frame),
+        *_band_rows(real.scan, simulated.scan),
+        *_fit_rows(real, simulated),
+        *(row for name in real.labels if name in simulated.labels for row in _label_rows(name, real, simulated)),
+        _ratio("labels", "DontCare per frame", real.dont_care_per_frame, simulated.dont_care_per_frame),
     ]
-    return Comparison(real, ours, tuple(rows), tuple(_skipped(real, ours)))
+    return Comparison(real, simulated, tuple(rows), tuple(_skipped(real, simulated)))
 
 
-def _scan_rows(real: ScanStatistics, ours: ScanStatistics) -> Iterator[Row]:
+def _scan_rows(real: ScanStatistics, simulated: ScanStatistics) -> Iterator[Row]:
     for name, field in _MEANS.items():
-        first, second = getattr(real, field), getattr(ours, field)
+        first, second = getattr(real, field), getattr(simulated, field)
         if first is not None and second is not None:
-            error = np.hypot(first.std / np.sqrt(real.scans), second.std / np.sqrt(ours.scans)) / first.mean
+            error = np.hypot(first.std / np.sqrt(real.scans), second.std / np.sqrt(simulated.scans)) / first.mean
             yield _ratio("scans", name, first.mean, second.mean, RATIO_BAR, float(error))
     for name, field in _PLACES.items():
-        first, second = getattr(real, field), getattr(ours, field)
+        first, second = getattr(real, field), getattr(simulated, field)
         if first is not None and second is not None and len(first) == len(second):
             yield Row("scans", name, None, None, "distance", float(jensen_shannon(first, second)))
 
 
-def _car_rows(real: ScanStatistics, ours: ScanStatistics) -> Iterator[Row]:
+def _car_rows(real: ScanStatistics, simulated: ScanStatistics) -> Iterator[Row]:
     for name, field in (("points of a car", "car_fit"), ("of near cars alone", "near_car_fit")):
-        first, second = getattr(real, field), getattr(ours, field)
+        first, second = getattr(real, field), getattr(simulated, field)
         if first is None or second is None:
             continue
         for range_m in CAR_RANGES_M:
@@ -258,22 +258,22 @@ def _reflectance_rows(real: ScanStatistics, measured: Measured) -> Iterator[Row]
         yield _ratio("reflectance", f"{name}, share of 0", float(p[0] / p.sum()), float(q[0] / q.sum()))
 
 
-def _band_rows(real: ScanStatistics, ours: ScanStatistics) -> Iterator[Row]:
+def _band_rows(real: ScanStatistics, simulated: ScanStatistics) -> Iterator[Row]:
     z, reflectance = real.ground_z_m, real.ground_reflectance
-    if z is None or reflectance is None or ours.ground_z_m is None or ours.ground_reflectance is None:
+    if z is None or reflectance is None or simulated.ground_z_m is None or simulated.ground_reflectance is None:
         return
-    yield from _by_range("ground", "mean height (m)", z, ours.ground_z_m)
-    for band, (first, second) in enumerate(zip(reflectance, ours.ground_reflectance, strict=True)):
+    yield from _by_range("ground", "mean height (m)", z, simulated.ground_z_m)
+    for band, (first, second) in enumerate(zip(reflectance, simulated.ground_reflectance, strict=True)):
         if first and second:
             yield _ratio("ground", f"mean reflectance, {_range_name(band)}", first.mean, second.mean)
 
 
-def _fit_rows(real: Statistics, ours: Statistics) -> Iterator[Row]:
+def _fit_rows(real: Statistics, simulated: Statistics) -> Iterator[Row]:
     """Yield rows of the median over the drives, with the drives' own spread as the tolerance."""
     for name, drives in real.label_fit.items():
-        if name not in ours.label_fit:
+        if name not in simulated.label_fit:
             continue
-        (fit,) = ours.label_fit[name]
+        (fit,) = simulated.label_fit[name]
         middle = float(np.median([drive.middle for drive in drives]))
         spread = max(abs(drive.middle - middle) for drive in drives)
         # A normal distribution has four fifths of its mass within 1.28 deviations; medians scatter by 1.25 / sqrt(n).
@@ -283,9 +283,9 @@ def _fit_rows(real: Statistics, ours: Statistics) -> Iterator[Row]:
         yield Row(group, name, middle, fit.middle, "difference", fit.middle - middle, bar, float(noise))
 
 
-def _label_rows(name: str, real: Statistics, ours: Statistics) -> Iterator[Row]:
-    first, second = real.labels[name], ours.labels[name]
-    yield _ratio(name, "per frame", first.count / real.frames, second.count / ours.frames)
+def _label_rows(name: str, real: Statistics, simulated: Statistics) -> Iterator[Row]:
+    first, second = real.labels[name], simulated.labels[name]
+    yield _ratio(name, "per frame", first.count / real.frames, second.count / simulated.frames)
     for size in ("height_m", "width_m", "length_m"):
         of_first, of_second = getattr(first, size), getattr(second, size)
         yield _ratio(name, f"{size.removesuffix('_m')}, mean (m)", of_first.mean, of_second.mean)
@@ -305,8 +305,10 @@ def _label_rows(name: str, real: Statistics, ours: Statistics) -> Iterator[Row]:
     yield from _by_range(name, "bottom (m)", first.bottom_z_m, second.bottom_z_m)
 
 
-def _by_range(group: str, what: str, real: tuple[Band | None, ...], ours: tuple[Band | None, ...]) -> Iterator[Row]:
-    for band, (first, second) in enumerate(zip(real, ours, strict=True)):
+def _by_range(
+    group: str, what: str, real: tuple[Band | None, ...], simulated: tuple[Band | None, ...]
+) -> Iterator[Row]:
+    for band, (first, second) in enumerate(zip(real, simulated, strict=True)):
         if first and second:
             yield _difference(group, f"{what}, {_range_name(band)}", first.mean, second.mean)
 
@@ -316,26 +318,26 @@ def _range_name(band: int) -> str:
 
 
 def _ratio(
-    group: str, name: str, real: float, ours: float, bar: float | None = None, noise: float | None = None
+    group: str, name: str, real: float, simulated: float, bar: float | None = None, noise: float | None = None
 ) -> Row:
-    return Row(group, name, real, ours, "ratio", ours / real if real else float("nan"), bar, noise)
+    return Row(group, name, real, simulated, "ratio", simulated / real if real else float("nan"), bar, noise)
 
 
-def _difference(group: str, name: str, real: float, ours: float) -> Row:
-    return Row(group, name, real, ours, "difference", ours - real)
+def _difference(group: str, name: str, real: float, simulated: float) -> Row:
+    return Row(group, name, real, simulated, "difference", simulated - real)
 
 
-def _skipped(real: Statistics, ours: Statistics) -> Iterator[str]:
-    if ours.scan.points is None:
+def _skipped(real: Statistics, made: Statistics) -> Iterator[str]:
+    if made.scan.points is None:
         yield (
             "the scans hold only what the camera sees: no points per scan and ring, ranges, ground by range, "
             "reflectances of all, ground and non_ground returns; simulate with --view full to compare them"
         )
-    elif ours.scan.points_per_ring is None or len(ours.scan.points_per_ring) != len(real.scan.points_per_ring or ()):
+    elif made.scan.points_per_ring is None or len(made.scan.points_per_ring) != len(real.scan.points_per_ring or ()):
         yield "the scans have another number of rings than KITTI's: no points per ring"
-    if ours.scan.car_fit is None:
+    if made.scan.car_fit is None:
         yield "too few unoccluded, untruncated cars between 12 and 70 m: no points per car"
-    for name in sorted(set(real.labels) - set(ours.labels)):
+    for name in sorted(set(real.labels) - set(made.labels)):
         yield f"no {name} is labelled"
-    for name in sorted(set(real.scan.reflectance) & set(OBJECTS) - set(ours.scan.reflectance)):
+    for name in sorted(set(real.scan.reflectance) & set(OBJECTS) - set(made.scan.reflectance)):
         yield f"no returns of a {name}: no reflectance"

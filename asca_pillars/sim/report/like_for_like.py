@@ -161,14 +161,17 @@ def compare_objects(real: Sequence[ObjectRecord], simulated: Sequence[ObjectReco
     """Return rows of each class that both sides have (for scores also one of all classes)."""
     rows, scores = [], []
     for name in CLASSES:
-        ours = [record for record in real if record.class_name == name]
-        theirs = [record for record in simulated if record.class_name == name]
-        if not ours or len(theirs) < NEIGHBORS:
+        of_real = [record for record in real if record.class_name == name]
+        of_simulated = [record for record in simulated if record.class_name == name]
+        if not of_real or len(of_simulated) < NEIGHBORS:
             continue
-        alike, of_like_points = look_alikes(ours, theirs), look_alikes(ours, theirs, like_points=True)
+        alike, of_like_points = (
+            look_alikes(of_real, of_simulated),
+            look_alikes(of_real, of_simulated, like_points=True),
+        )
         for measure in MEASURES:
-            value = np.array([getattr(record, measure) for record in ours])
-            among = np.array([getattr(record, measure) for record in theirs])
+            value = np.array([getattr(record, measure) for record in of_real])
+            among = np.array([getattr(record, measure) for record in of_simulated])
             among = among[of_like_points if measure == "score" else alike]
             if np.isfinite(value).all() and np.isfinite(among).all():
                 rows.append(_row(name, measure, value, among))
@@ -208,23 +211,23 @@ def _place(records: Sequence[ObjectRecord], like_points: bool) -> NDArray[np.flo
 
 def _row(name: str, measure: str, value: NDArray[np.float64], among: NDArray[np.float64]) -> LikeRow:
     counts = measure in _COUNTS
-    ours, theirs = (np.log(value), np.log(among).mean(axis=1)) if counts else (value, among.mean(axis=1))
+    measured, alike = (np.log(value), np.log(among).mean(axis=1)) if counts else (value, among.mean(axis=1))
     draws = np.random.default_rng(0).integers(len(value), size=(_DRAWS, len(value)))
     with np.errstate(divide="ignore", invalid="ignore"):
-        drawn = _ratio(ours[draws].mean(axis=1), theirs[draws].mean(axis=1), counts)
-        ratio = float(_ratio(ours.mean(), theirs.mean(), counts))
+        drawn = _ratio(measured[draws].mean(axis=1), alike[draws].mean(axis=1), counts)
+        ratio = float(_ratio(measured.mean(), alike.mean(), counts))
     low, high = np.nanpercentile(drawn, (2.5, 97.5)) if np.isfinite(drawn).any() else (np.nan, np.nan)
     rank = percentiles(value, among)
     error = max(float(rank.std()), 1 / np.sqrt(12)) / np.sqrt(len(rank))  # few objects may agree by chance
-    real, simulated = (float(np.exp(side.mean()) if counts else side.mean()) for side in (ours, theirs))
+    real, simulated = (float(np.exp(side.mean()) if counts else side.mean()) for side in (measured, alike))
     interval = float(low), float(high)
     return LikeRow(name, measure, len(value), real, simulated, ratio, interval, float(rank.mean()), error)
 
 
 def _ratio(
-    ours: NDArray[np.float64] | np.float64, theirs: NDArray[np.float64] | np.float64, logarithms: bool
+    real: NDArray[np.float64] | np.float64, simulated: NDArray[np.float64] | np.float64, logarithms: bool
 ) -> NDArray[np.float64]:
-    return np.asarray(np.exp(ours - theirs) if logarithms else ours / theirs)
+    return np.asarray(np.exp(real - simulated) if logarithms else real / simulated)
 
 
 PERSON_HEIGHT_M, THIN_M = (0.9, 2.2), 1.0

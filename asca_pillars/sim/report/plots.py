@@ -64,11 +64,11 @@ def save_figure(path: Path, figure: "Figure") -> str:
 
 def _reflectance(comparison: Comparison) -> "Figure":
     """Plot the fractions in the 21 bins, for each material; exactly 0 is the first."""
-    real, ours = comparison.real.scan.reflectance, comparison.simulated.scan.reflectance
+    real, simulated = comparison.real.scan.reflectance, comparison.simulated.scan.reflectance
     rows = {row.name: row for row in comparison.rows}
     figure, plots = new_figure(2, 4, 4.0, 3.0)
     for plot, name in zip(plots, MATERIALS, strict=False):
-        for side, style in ((real, _REAL), (ours, _OURS)):
+        for side, style in ((real, _REAL), (simulated, _OURS)):
             if name in side:
                 plot.stairs(_shares(coarse(side[name].counts)), _COARSE_EDGES, linewidth=1.6, **style)
         row = rows.get(f"reflectance: {name}")
@@ -112,9 +112,9 @@ def _cars(comparison: Comparison, measured: Measured) -> "Figure":
 
 def _scans(comparison: Comparison, sensor: Sensor) -> "Figure":
     """Plot the distribution of the returns of whole scans."""
-    real, ours = comparison.real.scan, comparison.simulated.scan
+    real, simulated = comparison.real.scan, comparison.simulated.scan
     figure, (rings, sectors, ranges, heights, reflectances, last) = new_figure(2, 3, 5.0, 3.4)
-    for side, style in ((real, _REAL), (ours, _OURS)):
+    for side, style in ((real, _REAL), (simulated, _OURS)):
         if side.points_per_ring is not None:
             rings.plot(side.points_per_ring, **style)
         if side.sector_points is not None:

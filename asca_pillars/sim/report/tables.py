@@ -47,8 +47,8 @@ def print_comparison(comparison: Comparison, console: Console) -> None:
 
 def title(comparison: Comparison) -> str:
     """Return the title of the report: the compared sets."""
-    ours, scan = comparison.simulated, comparison.simulated.scan
-    return f"{ours.source}: {scan.scans} scans and the labels of {ours.frames} frames, beside KITTI"
+    simulated, scan = comparison.simulated, comparison.simulated.scan
+    return f"{simulated.source}: {scan.scans} scans and the labels of {simulated.frames} frames, beside KITTI"
 
 
 def notes(comparison: Comparison) -> list[str]:
@@ -84,9 +84,9 @@ def to_markdown(comparison: Comparison, plots: Sequence[str]) -> str:
     for group in dict.fromkeys(row.group for row in comparison.rows):
         rows = [_cells(row) for row in comparison.rows if row.group == group]
         parts.append(f"## {group[0].upper()}{group[1:]}\n\n{markdown_table(columns, rows, _LEFT)}")
-    real, ours = comparison.real.label_fit, comparison.simulated.label_fit
-    if ours:
-        combined = {name: real.get(name, ()) + ours.get(name, ()) for name in dict.fromkeys([*real, *ours])}
+    real, simulated = comparison.real.label_fit, comparison.simulated.label_fit
+    if simulated:
+        combined = {name: real.get(name, ()) + simulated.get(name, ()) for name in dict.fromkeys([*real, *simulated])}
         parts.append(f"## The same by drive\n\n{fits_table(combined)}")
     parts += [f"![{name.removesuffix('.png').replace('_', ' ')}]({name})\n" for name in plots]
     return "\n".join(parts)

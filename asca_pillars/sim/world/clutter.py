@@ -175,13 +175,13 @@ def scatter(builder: Builder) -> None:
         along = float(rng.uniform(-80, 80))
         side = 1.0 if rng.random() < 0.5 else -1.0
         edge = ground.left_edge_m if side > 0 and rng.random() < 0.7 else ground.half_width_m
-        beside = rng.uniform(0.25, 0.8) if rng.random() < 0.35 else rng.uniform(0.3, pavement + 6.0)
+        lateral = rng.uniform(0.25, 0.8) if rng.random() < 0.35 else rng.uniform(0.3, pavement + 6.0)
         if rng.random() < 0.22:
-            edge, beside = 0.0, rng.uniform(edge + 2.0, SCATTERED_WITHIN_M)
+            edge, lateral = 0.0, rng.uniform(edge + 2.0, SCATTERED_WITHIN_M)
         elif rng.random() < 0.07:  # between parked cars, as planted build-outs of the kerb are
-            beside = -rng.uniform(0.3, 1.8)
+            lateral = -rng.uniform(0.3, 1.8)
         if not builder.near_junction(along, along):
-            things[bisect_left(upto, rng.random())](builder, along, float(side * (edge + beside)))
+            things[bisect_left(upto, rng.random())](builder, along, float(side * (edge + lateral)))
     for _ in range(rng.poisson(builder.config.far_clutter)):
         along = float(rng.choice([-1.0, 1.0]) * rng.uniform(28.0, 75.0))
         across = float(rng.choice([-1.0, 1.0]) * (ground.half_width_m + rng.uniform(0.0, 30.0)))

@@ -61,10 +61,10 @@ def pole_group(builder: Builder, along: float, across: float) -> None:
     """Add two to five posts close together, as at crossings: from afar as wide as a person."""
     rng = builder.rng
     for _ in range(int(rng.integers(2, 6))):
-        at, beside = along + float(rng.normal(0, 0.35)), across + float(rng.normal(0, 0.35))
+        at, lateral = along + float(rng.normal(0, 0.35)), across + float(rng.normal(0, 0.35))
         radius = float(rng.uniform(0.025, 0.09))
-        if builder.reserve(at, beside, 2 * radius, 2 * radius):
-            builder.post(at, beside, -0.2, float(rng.uniform(1.2, 4.5)), radius, float(rng.uniform(0.1, 0.6)))
+        if builder.reserve(at, lateral, 2 * radius, 2 * radius):
+            builder.post(at, lateral, -0.2, float(rng.uniform(1.2, 4.5)), radius, float(rng.uniform(0.1, 0.6)))
 
 
 def bollards(builder: Builder, along: float, across: float) -> None:
@@ -109,11 +109,11 @@ def bins(builder: Builder, along: float, across: float) -> None:
     rng = builder.rng
     size = (1.3, 0.95, 1.35) if rng.random() < 0.25 else (0.52, 0.6, 1.05)
     for i in range(int(rng.integers(1, 7))):
-        at, beside = along + i * (size[0] + float(rng.uniform(0.03, 0.3))), across + float(rng.normal(0, 0.08))
-        if builder.reserve(at, beside, size[0], size[1]):
+        at, lateral = along + i * (size[0] + float(rng.uniform(0.03, 0.3))), across + float(rng.normal(0, 0.08))
+        if builder.reserve(at, lateral, size[0], size[1]):
             yaw = float(rng.normal(0, 0.15))
-            builder.box(at, beside, 0.08, (size[0], size[1], size[2] - 0.15), material(builder), yaw=yaw)
-            builder.box(at, beside, size[2] - 0.07, (size[0], 1.08 * size[1], 0.07), (0.1, 0.4, 0.0), yaw=yaw)
+            builder.box(at, lateral, 0.08, (size[0], size[1], size[2] - 0.15), material(builder), yaw=yaw)
+            builder.box(at, lateral, size[2] - 0.07, (size[0], 1.08 * size[1], 0.07), (0.1, 0.4, 0.0), yaw=yaw)
 
 
 def bench(builder: Builder, along: float, across: float) -> None:
@@ -125,10 +125,10 @@ def bench(builder: Builder, along: float, across: float) -> None:
     plank = material(builder)
     if table:
         builder.box(along, across, 0.7, (1.7, 0.75, 0.06), plank)
-    for beside in (-0.6, 0.6) if table else (0.0,):
-        builder.box(along, across + beside, 0.40, (1.7, 0.4, 0.06), plank)
+    for lateral in (-0.6, 0.6) if table else (0.0,):
+        builder.box(along, across + lateral, 0.40, (1.7, 0.4, 0.06), plank)
         for leg in (-0.7, 0.7):
-            builder.box(along + leg, across + beside, -0.1, (0.08, 0.35, 0.5), plank)
+            builder.box(along + leg, across + lateral, -0.1, (0.08, 0.35, 0.5), plank)
     if not table and rng.random() < 0.7:
         builder.box(along, across + (0.22 if across > 0 else -0.22), 0.5, (1.7, 0.05, 0.4), plank)
 
@@ -186,12 +186,12 @@ def barrier_boards(builder: Builder, along: float, across: float) -> None:
     step, height = (3.4, 2.0) if mesh else (float(rng.uniform(1.2, 2.2)), 1.0)
     board: Material = (0.35, 0.4, 0.88) if mesh else (float(rng.uniform(0.4, 0.8)), 0.4, 0.0)
     for i in range(int(rng.integers(1, 7))):
-        at, beside = along + i * step, across + float(rng.normal(0, 0.1))
-        if builder.near_junction(at, at) or not builder.reserve(at, beside, step - 0.1, 0.3):
+        at, lateral = along + i * step, across + float(rng.normal(0, 0.1))
+        if builder.near_junction(at, at) or not builder.reserve(at, lateral, step - 0.1, 0.3):
             continue
-        builder.box(at - step / 2, beside, -0.05, (0.25, 0.6, 0.15), (0.1, 0.3, 0.0))
-        builder.post(at - step / 2, beside, 0.0, height + 0.1, 0.025, 0.4)
-        builder.box(at, beside, 0.15 if mesh else height - 0.3, (step, 0.03, height - 0.15 if mesh else 0.25), board)
+        builder.box(at - step / 2, lateral, -0.05, (0.25, 0.6, 0.15), (0.1, 0.3, 0.0))
+        builder.post(at - step / 2, lateral, 0.0, height + 0.1, 0.025, 0.4)
+        builder.box(at, lateral, 0.15 if mesh else height - 0.3, (step, 0.03, height - 0.15 if mesh else 0.25), board)
 
 
 def low_stones(builder: Builder, along: float, across: float) -> None:
@@ -289,8 +289,8 @@ def leaning_board(builder: Builder, along: float, across: float) -> None:
         return
     face, slices, lean = material(builder), 5, float(rng.uniform(0.15, 0.45))
     for i in range(slices):
-        beside = across + lean * tall * (i / slices - 0.5)
-        builder.box(along, beside, i * tall / slices, (wide, 0.08, tall / slices), face)
+        lateral = across + lean * tall * (i / slices - 0.5)
+        builder.box(along, lateral, i * tall / slices, (wide, 0.08, tall / slices), face)
     builder.post(along, across + 0.5 * lean * tall + 0.1, -0.2, float(rng.uniform(1.5, 4.0)), 0.05, 0.35)
 
 
@@ -307,8 +307,8 @@ def mast(builder: Builder, along: float, across: float) -> None:
     for _ in range(int(rng.integers(1, 4))):
         size = (float(rng.uniform(0.15, 0.4)), float(rng.uniform(0.25, 0.6)), float(rng.uniform(0.25, 0.8)))
         turn = float(rng.uniform(0, 2 * np.pi))
-        at, beside = along + radius * np.cos(turn), across + radius * np.sin(turn)
-        builder.box(float(at), float(beside), z, size, material(builder), yaw=turn)
+        at, lateral = along + radius * np.cos(turn), across + radius * np.sin(turn)
+        builder.box(float(at), float(lateral), z, size, material(builder), yaw=turn)
         z += size[2] * float(rng.uniform(0.6, 1.2))
     if rng.random() < 0.5:  # tape or a notice
         z, height = float(rng.uniform(0.5, 1.6)), float(rng.uniform(0.1, 0.5))
@@ -339,10 +339,10 @@ def wall_end(builder: Builder, along: float, across: float) -> None:
         yaw = float(rng.choice([0.0, 1.57]) + rng.normal(0, 0.1))
         builder.box(along, across, -0.3, (length, thick, tall + 0.3), stone, yaw=yaw)
         if rng.random() < 0.5:
-            beside = across + (0.5 * length if yaw > 0.8 else 0.0)
+            lateral = across + (0.5 * length if yaw > 0.8 else 0.0)
             builder.box(
                 along if yaw > 0.8 else along + 0.5 * length,
-                beside,
+                lateral,
                 -0.3,
                 (thick + 0.12, thick + 0.12, tall + 0.5),
                 stone,
@@ -354,18 +354,18 @@ def fragments(builder: Builder, along: float, across: float) -> None:
     rng = builder.rng
     tall = float(rng.uniform(0.3, 1.9))
     for _ in range(int(rng.integers(1, 4))):
-        at, beside = along + float(rng.normal(0, 0.4)), across + float(rng.normal(0, 0.4))
+        at, lateral = along + float(rng.normal(0, 0.4)), across + float(rng.normal(0, 0.4))
         size = (float(rng.uniform(0.08, 0.4)), float(rng.uniform(0.08, 0.4)), tall * float(rng.uniform(0.4, 1.0)))
-        if builder.reserve(at, beside, size[0], size[1]):
+        if builder.reserve(at, lateral, size[0], size[1]):
             foot = 0.0 if rng.random() < 0.7 else float(rng.uniform(0.1, 0.6))
-            builder.box(at, beside, foot - 0.05, size, material(builder), yaw=float(rng.uniform(0, 3.1)))
+            builder.box(at, lateral, foot - 0.05, size, material(builder), yaw=float(rng.uniform(0, 3.1)))
 
 
 def low_pieces(builder: Builder, along: float, across: float) -> None:
     """Add sparse objects hardly higher than a kerb."""
     rng = builder.rng
     for _ in range(int(rng.integers(1, 6))):
-        at, beside = along + float(rng.normal(0, 1.5)), across + float(rng.normal(0, 1.0))
+        at, lateral = along + float(rng.normal(0, 1.5)), across + float(rng.normal(0, 1.0))
         size = (float(rng.uniform(0.15, 1.0)), float(rng.uniform(0.15, 0.6)), float(rng.uniform(0.1, 0.7)))
-        if builder.reserve(at, beside, size[0], size[1]):
-            builder.box(at, beside, -0.1, (size[0], size[1], size[2] + 0.1), material(builder))
+        if builder.reserve(at, lateral, size[0], size[1]):
+            builder.box(at, lateral, -0.1, (size[0], size[1], size[2] + 0.1), material(builder))

@@ -48,9 +48,9 @@ def litter_bin(builder: Builder, along: float, across: float) -> None:
     if rng.random() < 0.6:
         size = (wide + 0.02, 0.5 * deep, float(rng.uniform(0.15, 0.3)))
         builder.box(along, across + 0.1, top - size[2] - 0.1, size, (_foil(builder), 0.3, 0.0), yaw=yaw)
-    beside = along + float(rng.uniform(0.6, 1.0))
-    if rng.random() < 0.4 and builder.reserve(beside, across, 0.7, 0.4):
-        builder.box(beside, across, -0.1, (0.6, 0.4, float(rng.uniform(0.8, 1.2)) + 0.1), material(builder), yaw=yaw)
+    ahead = along + float(rng.uniform(0.6, 1.0))
+    if rng.random() < 0.4 and builder.reserve(ahead, across, 0.7, 0.4):
+        builder.box(ahead, across, -0.1, (0.6, 0.4, float(rng.uniform(0.8, 1.2)) + 0.1), material(builder), yaw=yaw)
 
 
 def cabinet_and_panel(builder: Builder, along: float, across: float) -> None:
@@ -122,8 +122,8 @@ def slim_pillars(builder: Builder, along: float, across: float) -> None:
     if rng.random() < 0.4:  # thicker below
         builder.post(along - 0.3, across, -0.1, float(rng.uniform(0.6, 1.25)), 2 * radius, grey)
     lean = float(rng.normal(0.0, 0.12))
-    beside, tall = along - 0.3 + float(rng.uniform(0.3, 0.8)), float(rng.uniform(0.5, 1.25))
-    builder.post(beside, across, -0.2, tall + 0.2, float(rng.uniform(0.06, 0.2)), grey, lean=(lean, 0.5 * lean))
+    further_along, tall = along - 0.3 + float(rng.uniform(0.3, 0.8)), float(rng.uniform(0.5, 1.25))
+    builder.post(further_along, across, -0.2, tall + 0.2, float(rng.uniform(0.06, 0.2)), grey, lean=(lean, 0.5 * lean))
 
 
 def low_sign(builder: Builder, along: float, across: float) -> None:
@@ -154,8 +154,8 @@ def warning_barrier(builder: Builder, along: float, across: float) -> None:
     foot, tall = float(rng.uniform(0.6, 0.9)), float(rng.uniform(0.2, 0.5))
     yaw = float(rng.normal(0.0, 0.4))
     builder.box(along, across, foot, (0.04, wide, tall), (_foil(builder), 0.3, 0.0), yaw=yaw)
-    for beside in (-0.4 * wide, 0.4 * wide):
-        builder.post(along, across + beside, -0.1, foot + 0.1, 0.015, 0.05, lean=(float(rng.normal(0, 0.15)), 0.0))
+    for lateral in (-0.4 * wide, 0.4 * wide):
+        builder.post(along, across + lateral, -0.1, foot + 0.1, 0.015, 0.05, lean=(float(rng.normal(0, 0.15)), 0.0))
 
 
 def bicycle_at_post(builder: Builder, along: float, across: float) -> None:
@@ -190,11 +190,11 @@ def posts_at_corners(builder: Builder, along: float, across: float) -> None:
     if not builder.reserve(along, across, long, wide):
         return
     for at in (-0.5, 0.5):
-        for beside in (-0.5, 0.5):
+        for lateral in (-0.5, 0.5):
             if rng.random() < 0.85:
                 place = (
                     along + at * long + float(rng.normal(0, 0.2)),
-                    across + beside * wide + float(rng.normal(0, 0.1)),
+                    across + lateral * wide + float(rng.normal(0, 0.1)),
                 )
                 tall, radius = float(rng.uniform(0.4, 1.3)), float(rng.uniform(0.05, 0.25))
                 builder.post(

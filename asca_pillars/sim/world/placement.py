@@ -55,11 +55,11 @@ class Habits:
         self.riders: list[Neighbor] = []
         # Zebra crossings are at junctions, or anywhere: one ahead, one behind.
         at_junction = ground.cross_half_m > 0 and rng.random() < config.zebra_at_junction
-        beside = ground.cross_u_m - rng.choice([-1.0, 1.0]) * (ground.cross_half_m + 2.5)
+        corner_u_m = ground.cross_u_m - rng.choice([-1.0, 1.0]) * (ground.cross_half_m + 2.5)
         anywhere = float(rng.uniform(6.0, 45.0))
         self.zebra_u = (
-            float(beside) if at_junction and beside > 0 else anywhere,
-            float(beside) if at_junction and beside < 0 else -anywhere,
+            float(corner_u_m) if at_junction and corner_u_m > 0 else anywhere,
+            float(corner_u_m) if at_junction and corner_u_m < 0 else -anywhere,
         )
 
     def vehicle(self, size: Floats, way: float) -> Candidate:
@@ -154,9 +154,9 @@ class Habits:
         rng, config, half = self.rng, self.config, self.ground.half_width_m
         if self.riders and rng.random() < config.riding_together:  # side by side, or one behind the other
             u, v, heading, _ = self.riders[int(rng.integers(len(self.riders)))]
-            beside = rng.random() < 0.4
-            u += rng.normal(0, 0.4) if beside else rng.choice([-1, 1]) * rng.uniform(2.2, 6.0)
-            v += rng.choice([-1, 1]) * rng.uniform(0.8, 1.3) if beside else rng.normal(0, 0.3)
+            overtakes = rng.random() < 0.4
+            u += rng.normal(0, 0.4) if overtakes else rng.choice([-1, 1]) * rng.uniform(2.2, 6.0)
+            v += rng.choice([-1, 1]) * rng.uniform(0.8, 1.3) if overtakes else rng.normal(0, 0.3)
         elif rng.random() < config.cyclist_crossing:
             u, v = way * self._distance(2.0, 12.5), rng.uniform(-half - 6.0, half + 6.0)
             heading = float(rng.choice([-1, 1]) * np.pi / 2 + rng.normal(0, 0.45))
@@ -359,15 +359,15 @@ class Occupied:
 @cached()
 def _is_free(row: tuple[float, float, float, float, float, float], rows: Floats, count: int) -> bool:
     """Return whether a footprint overlaps none of the first `count` (separating axes of two rectangles)."""
-    own = (row[2], row[3], row[4])
+    footprint = (row[2], row[3], row[4])
     for i in range(count):
         taken = (rows[i, 2], rows[i, 3], rows[i, 4])
         dx, dy = rows[i, 0] - row[0], rows[i, 1] - row[1]
-        if max(abs(dx), abs(dy)) > (own[0] + own[1] + taken[0] + taken[1]) / 2:
+        if max(abs(dx), abs(dy)) > (footprint[0] + footprint[1] + taken[0] + taken[1]) / 2:
             continue  # farther apart than half the diagonals
         apart = False
         overlap = min(row[5], rows[i, 5])
-        for one, other in ((own, taken), (taken, own)):
+        for one, other in ((footprint, taken), (taken, footprint)):
             cos, sin = np.cos(one[2]), np.sin(one[2])
             c, s = abs(np.cos(other[2] - one[2])), abs(np.sin(other[2] - one[2]))
             along, across = abs(dx * cos + dy * sin), abs(dy * cos - dx * sin)

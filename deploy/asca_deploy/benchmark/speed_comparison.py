@@ -117,14 +117,14 @@ class BoxDifference:
     score: float
 
 
-def box_difference(expected: Sequence[Detections], found: Sequence[Detections]) -> BoxDifference:
+def box_difference(expected: Sequence[Detections], others: Sequence[Detections]) -> BoxDifference:
     """Pair the boxes of the same scans, each with the nearest one of its class that is still free, best first."""
     pairs = lone = 0
     largest_m = largest_score = 0.0
-    for ours, theirs in zip(expected, found, strict=True):
-        free, names = np.ones(len(theirs), bool), np.array(theirs.names, dtype=str)
-        for box, score, name in zip(ours.boxes, ours.scores, ours.names, strict=True):
-            distances = np.linalg.norm(theirs.boxes[:, :3] - box[:3], axis=1)
+    for reference, compared in zip(expected, others, strict=True):
+        free, names = np.ones(len(compared), bool), np.array(compared.names, dtype=str)
+        for box, score, name in zip(reference.boxes, reference.scores, reference.names, strict=True):
+            distances = np.linalg.norm(compared.boxes[:, :3] - box[:3], axis=1)
             distances[~free | (names != name)] = np.inf
             if distances.min(initial=np.inf) > SAME_OBJECT_M:
                 lone += 1
@@ -132,8 +132,8 @@ def box_difference(expected: Sequence[Detections], found: Sequence[Detections]) 
             nearest = int(distances.argmin())
             free[nearest] = False
             pairs += 1
-            largest_m = max(largest_m, float(np.abs(theirs.boxes[nearest, :6] - box[:6]).max()))
-            largest_score = max(largest_score, float(abs(theirs.scores[nearest] - score)))
+            largest_m = max(largest_m, float(np.abs(compared.boxes[nearest, :6] - box[:6]).max()))
+            largest_score = max(largest_score, float(abs(compared.scores[nearest] - score)))
         lone += int(free.sum())
     return BoxDifference(pairs, lone, largest_m, largest_score)
 

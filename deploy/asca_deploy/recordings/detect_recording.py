@@ -237,7 +237,7 @@ class _Run:
 
     def results(self) -> Iterator[None]:
         """Yield one item for each scan that is in the journal now."""
-        for found in self._detector.stream(self._points()):
+        for detections in self._detector.stream(self._points()):
             yield from self._skip()
             scan = self._coming.popleft()
             assert scan.scan is not None, "only scans that could be read are streamed"
@@ -246,12 +246,12 @@ class _Run:
                     scan.number,
                     scan.time_ns,
                     scan.frame_id,
-                    found,
-                    dropped_points=scan.scan.dropped_points + found.report.non_finite_points,
+                    detections,
+                    dropped_points=scan.scan.dropped_points + detections.report.non_finite_points,
                 )
             )
             where = self._scans.recording.path / str(scan.number)
-            self.kept.append(DetectedScan(where, scan.scan.notes, found))
+            self.kept.append(DetectedScan(where, scan.scan.notes, detections))
             yield
         yield from self._skip()
 
@@ -338,9 +338,9 @@ def _with_points(
 ) -> Iterator[tuple[FrameResult, NDArray[np.float32] | None]]:
     """Yield each result with the points of its scan, which is read once more; None without `scans`."""
     again = iter(()) if scans is None else scans.read()
-    for found in results:
-        points = (one.scan.points for one in again if one.number == found.number and one.scan is not None)
-        yield found, None if scans is None else next(points)
+    for result in results:
+        points = (one.scan.points for one in again if one.number == result.number and one.scan is not None)
+        yield result, None if scans is None else next(points)
 
 
 def _write(
@@ -363,11 +363,11 @@ def _write(
         files += opened(places, handles)
         scans_written = 0
         classes: Counter[str] = Counter()
-        for found, points in results:
+        for result, points in results:
             scans_written += 1
-            classes.update(found.detections.names)
+            classes.update(result.detections.names)
             for file in files:
-                file.write(found, points)
+                file.write(result, points)
         handles.close()  # before the names are changed
     remove_companions(task.out, [ABOUT_FILE, *([] if calibration is None else [KITTI_FILE])])
     return scans_written, classes

@@ -89,21 +89,21 @@ class FoxgloveFile:
         schema = self._writer.register_schema("foxglove.SceneUpdate", "jsonschema", json.dumps(SCHEMA).encode())
         self._channel = self._writer.register_channel(TOPIC, "json", schema)
 
-    def write(self, found: FrameResult, points: NDArray[np.float32] | None = None) -> None:
+    def write(self, result: FrameResult, points: NDArray[np.float32] | None = None) -> None:
         """Write one message."""
-        data = json.dumps(scene_update(found)).encode()
-        self._writer.add_message(self._channel, found.time_ns, data, found.time_ns, found.number)
+        data = json.dumps(scene_update(result)).encode()
+        self._writer.add_message(self._channel, result.time_ns, data, result.time_ns, result.number)
 
     def finish(self) -> None:
         """Write the index and the end."""
         self._writer.finish()
 
 
-def scene_update(found: FrameResult) -> dict[str, Any]:
+def scene_update(result: FrameResult) -> dict[str, Any]:
     """Return a scan's boxes as the fields of foxglove.SceneUpdate."""
-    time = {"sec": found.time_ns // 10**9, "nsec": found.time_ns % 10**9}
+    time = {"sec": result.time_ns // 10**9, "nsec": result.time_ns % 10**9}
     entities = []
-    for row, box in enumerate(found.detections):
+    for row, box in enumerate(result.detections):
         x, y, z, length, width, height, yaw = box[2:]
         red, green, blue = class_shares(box.class_name)
         color = {"r": red, "g": green, "b": blue, "a": 0.4}
@@ -111,9 +111,9 @@ def scene_update(found: FrameResult) -> dict[str, Any]:
         above = {"position": {"x": x, "y": y, "z": z + height / 2 + 0.4}, "orientation": _about_z(0.0)}
         name, text, arrows = f"box-{row}", f"{box.class_name} {box.score:.2f}", []
         metadata = [{"key": "class", "value": box.class_name}, {"key": "score", "value": f"{box.score:.3f}"}]
-        if found.tracks is not None:
-            number = int(found.tracks.track_ids[row])
-            vx, vy = found.tracks.velocities_mps[row].tolist()
+        if result.tracks is not None:
+            number = int(result.tracks.track_ids[row])
+            vx, vy = result.tracks.velocities_mps[row].tolist()
             speed = float(np.hypot(vx, vy))
             name, text = f"track-{number}", f"{box.class_name} {number}"
             metadata += [{"key": "track_id", "value": str(number)}, {"key": "speed_mps", "value": f"{speed:.2f}"}]
@@ -122,7 +122,7 @@ def scene_update(found: FrameResult) -> dict[str, Any]:
         entities.append(
             {
                 "timestamp": time,
-                "frame_id": found.frame_id,
+                "frame_id": result.frame_id,
                 "id": name,
                 "lifetime": {"sec": 0, "nsec": 0},
                 "frame_locked": True,

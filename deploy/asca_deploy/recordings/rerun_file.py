@@ -52,21 +52,21 @@ class RerunFile:
         self._failed = False
         self._ground_m: float | None = None
 
-    def write(self, found: FrameResult, points: NDArray[np.float32] | None) -> None:
+    def write(self, result: FrameResult, points: NDArray[np.float32] | None) -> None:
         """Write one scan with its boxes."""
         assert points is not None, "it shows points"
         rr, stream = self._rr, self._stream
-        stream.set_time(TIMELINE, timestamp=np.datetime64(found.time_ns, "ns"))
+        stream.set_time(TIMELINE, timestamp=np.datetime64(result.time_ns, "ns"))
         subset = points[:: -(-len(points) // MAX_POINTS) or 1]
         if self._ground_m is None and len(points):
             self._ground_m = ground_height(points[:, 2])  # once: colors do not flicker
         colors = height_rgb(subset[:, 2], self._ground_m or 0.0)
         stream.log("scan", rr.Points3D(subset[:, :3], colors=colors, radii=0.03))
-        stream.log("boxes", self._boxes(found))
-        if found.tracks is not None:
-            stream.log("velocities", self._velocities(found))
+        stream.log("boxes", self._boxes(result))
+        if result.tracks is not None:
+            stream.log("velocities", self._velocities(result))
         if self._images is not None:
-            self._show(self._images.at(found.time_ns))
+            self._show(self._images.at(result.time_ns))
         self._flush()
 
     def finish(self) -> None:
@@ -108,34 +108,34 @@ class RerunFile:
         else:
             self._stream.log(_CAMERA, self._rr.Image(image.content, color_model=image.kind))
 
-    def _velocities(self, found: FrameResult) -> Any:
+    def _velocities(self, result: FrameResult) -> Any:
         """Return an arrow for each moving track, as long as its way of one second, from the center of its roof."""
-        assert found.tracks is not None
-        moving = np.hypot(*found.tracks.velocities_mps.T) > MOVES_MPS
-        boxes, velocities = found.detections.boxes[moving], found.tracks.velocities_mps[moving]
+        assert result.tracks is not None
+        moving = np.hypot(*result.tracks.velocities_mps.T) > MOVES_MPS
+        boxes, velocities = result.detections.boxes[moving], result.tracks.velocities_mps[moving]
         return self._rr.Arrows3D(
             origins=np.column_stack([boxes[:, :2], boxes[:, 2] + boxes[:, 5] / 2]),
             vectors=np.column_stack([velocities, np.zeros(len(velocities))]),
-            colors=self._colors(found)[moving],
+            colors=self._colors(result)[moving],
             radii=0.06,
         )
 
-    def _colors(self, found: FrameResult) -> NDArray[np.uint8]:
-        return np.array([class_rgb(name) for name in found.detections.names], np.uint8).reshape(-1, 3)
+    def _colors(self, result: FrameResult) -> NDArray[np.uint8]:
+        return np.array([class_rgb(name) for name in result.detections.names], np.uint8).reshape(-1, 3)
 
-    def _boxes(self, found: FrameResult) -> Any:
-        rr, boxes = self._rr, found.detections.boxes
+    def _boxes(self, result: FrameResult) -> Any:
+        rr, boxes = self._rr, result.detections.boxes
         half: NDArray[np.float64] = boxes[:, 6].astype(np.float64) / 2
         quaternions = np.stack([0 * half, 0 * half, np.sin(half), np.cos(half)], axis=1)
-        if found.tracks is None:
-            labels = [f"{box.class_name} {box.score:.2f}" for box in found.detections]
+        if result.tracks is None:
+            labels = [f"{box.class_name} {box.score:.2f}" for box in result.detections]
         else:
-            labels = [f"{track.detection.class_name} {track.track_id}" for track in found.tracks]
+            labels = [f"{track.detection.class_name} {track.track_id}" for track in result.tracks]
         return rr.Boxes3D(
             centers=boxes[:, :3],
             sizes=boxes[:, 3:6],
             quaternions=quaternions,
             labels=labels,
-            colors=self._colors(found),
+            colors=self._colors(result),
             radii=0.02,
         )

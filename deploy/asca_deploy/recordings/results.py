@@ -105,12 +105,16 @@ class Journal:
 
     def add(self, result: ScanResult) -> None:
         """Append a scan's result; it outlives a kill from here on."""
-        found = result.detections
+        detections = result.detections
         line: dict[str, Any] = {"number": result.number, "time_ns": result.time_ns, "frame_id": result.frame_id}
-        if found is None:
+        if detections is None:
             line["trouble"] = result.error_text
         else:
-            line |= {"boxes": found.boxes.tolist(), "scores": found.scores.tolist(), "labels": found.labels.tolist()}
+            line |= {
+                "boxes": detections.boxes.tolist(),
+                "scores": detections.scores.tolist(),
+                "labels": detections.labels.tolist(),
+            }
             line["dropped_points"] = result.dropped_points
         content = add_checksum(json.dumps(line), self._about).encode()
         try:
@@ -198,7 +202,7 @@ class FrameResult(NamedTuple):
 class ResultFile(Protocol):
     """Output of results, one scan after the other."""
 
-    def write(self, found: FrameResult, points: NDArray[np.float32] | None) -> None:
+    def write(self, result: FrameResult, points: NDArray[np.float32] | None) -> None:
         """Write the next scan, and its points (N, 4) where some file of the run draws them."""
 
 
@@ -212,15 +216,15 @@ def track_results(
         tracker: a new one.
         pose_at: from a time, nanoseconds, to the (4, 4) pose of the scan, metres; None: unknown.
     """
-    found = (
+    tracked = (
         FrameResult(one.number, one.time_ns, one.frame_id, one.detections, None, one.dropped_points)
         for one in journal.results()
         if one.detections is not None
     )
     if tracker is None:
-        yield from found
+        yield from tracked
         return
-    results = list(found)
+    results = list(tracked)
     for index in tracking_order([one.time_ns for one in results]):
         one = results[index]
         tracks = _track(tracker, one, None if pose_at is None else pose_at(one.time_ns))
@@ -228,13 +232,13 @@ def track_results(
     yield from results
 
 
-def _track(tracker: Tracker, found: FrameResult, pose: NDArray[np.float64] | None) -> Tracks:
+def _track(tracker: Tracker, result: FrameResult, pose: NDArray[np.float64] | None) -> Tracks:
     """Track the next scan; mirrored, if its frame is a mirror image, as its pose is then no rotation."""
-    time_s = found.time_ns * 1e-9
+    time_s = result.time_ns * 1e-9
     if pose is None or np.linalg.det(pose[:3, :3]) > 0:
-        return tracker(found.detections, time_s, pose)
-    boxes = _MIRROR.boxes(found.detections.boxes)
-    tracks = tracker(replace(found.detections, boxes=boxes), time_s, pose @ np.diag([1.0, -1.0, 1.0, 1.0]))
+        return tracker(result.detections, time_s, pose)
+    boxes = _MIRROR.boxes(result.detections.boxes)
+    tracks = tracker(replace(result.detections, boxes=boxes), time_s, pose @ np.diag([1.0, -1.0, 1.0, 1.0]))
     detections = replace(tracks.detections, boxes=_MIRROR.boxes(tracks.detections.boxes))
     return Tracks(detections, tracks.track_ids, tracks.velocities_mps @ _MIRROR.axes[:2, :2])
 
@@ -273,17 +277,17 @@ class JsonLines:
     def __init__(self, file: IO[str], recording: str, scope: DetectorScope) -> None:
         self._file, self._recording, self._detector = file, recording, scope.to_json()
 
-    def write(self, found: FrameResult, points: NDArray[np.float32] | None = None) -> None:
+    def write(self, result: FrameResult, points: NDArray[np.float32] | None = None) -> None:
         """Write one line."""
-        boxes = found.detections.to_dicts() if found.tracks is None else found.tracks.to_dicts()
+        boxes = result.detections.to_dicts() if result.tracks is None else result.tracks.to_dicts()
         line = {
-            "scan": f"{self._recording}/{found.number:06d}",
-            "time_s": found.time_ns / 1e9,
-            "time_ns": found.time_ns,
-            "frame_id": found.frame_id,
+            "scan": f"{self._recording}/{result.number:06d}",
+            "time_s": result.time_ns / 1e9,
+            "time_ns": result.time_ns,
+            "frame_id": result.frame_id,
             "boxes": boxes,
             "detector": self._detector,
-            "points_not_finite": found.dropped_points,
+            "points_not_finite": result.dropped_points,
         }
         self._file.write(json.dumps(line) + "\n")
 
@@ -294,14 +298,14 @@ class KittiTracks:
     def __init__(self, file: IO[str], calibration: Calibration) -> None:
         self._file, self._calibration = file, calibration
 
-    def write(self, found: FrameResult, points: NDArray[np.float32] | None = None) -> None:
+    def write(self, result: FrameResult, points: NDArray[np.float32] | None = None) -> None:
         """Write the lines of one scan."""
-        boxes = found.detections
+        boxes = result.detections
         objects = objects_from_boxes(boxes.boxes, boxes.names, self._calibration, DEFAULT_IMAGE_SIZE_WH, boxes.scores)
-        ids = [-1] * len(objects) if found.tracks is None else found.tracks.track_ids.tolist()
+        ids = [-1] * len(objects) if result.tracks is None else result.tracks.track_ids.tolist()
         for number, item in zip(ids, objects, strict=True):
             if item.bbox[2] > item.bbox[0]:
-                self._file.write(f"{found.number} {number} {labels_text([item])}")
+                self._file.write(f"{result.number} {number} {labels_text([item])}")
 
 
 def open_text(stack: ExitStack, path: Path) -> IO[str]:

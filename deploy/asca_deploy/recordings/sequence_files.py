@@ -74,12 +74,12 @@ class RecordingVideo:
         self._file, self._pose_at = VideoFile(path, rate_hz), pose_at
         self._video = BoxVideo(self._file, view, ranges, level)
 
-    def write(self, found: FrameResult, points: NDArray[np.float32] | None) -> None:
+    def write(self, result: FrameResult, points: NDArray[np.float32] | None) -> None:
         """Write one picture."""
         assert points is not None, "it shows points"
-        ids = None if found.tracks is None else found.tracks.track_ids
-        pose = None if self._pose_at is None else self._pose_at(found.time_ns)
-        self._video.add(points, found.detections, found.time_ns / 1e9, ids, pose)
+        ids = None if result.tracks is None else result.tracks.track_ids
+        pose = None if self._pose_at is None else self._pose_at(result.time_ns)
+        self._video.add(points, result.detections, result.time_ns / 1e9, ids, pose)
 
     def finish(self) -> None:
         """Write the end."""

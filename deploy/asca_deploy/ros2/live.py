@@ -123,13 +123,13 @@ class LiveDetection:
                 taken: _Taken = self._queue.next_tag()
                 self._working_since = monotonic()
                 # One scan at a time: a stream takes two more ahead, so that each answer would be later.
-                found = self._detector(points)
-                boxes: ScanDetections | Tracks = found
+                detections = self._detector(points)
+                boxes: ScanDetections | Tracks = detections
                 if self._tracker is not None:
-                    boxes = self._tracker(found, taken.stamp.seconds or taken.at_s)
+                    boxes = self._tracker(detections, taken.stamp.seconds or taken.at_s)
                 self._answer(taken.stamp, boxes)
                 names = boxes.detections.names if isinstance(boxes, Tracks) else boxes.names
-                self.health.count_answered(1e3 * (monotonic() - taken.at_s), names, found.report.warnings)
+                self.health.count_answered(1e3 * (monotonic() - taken.at_s), names, detections.report.warnings)
                 self._working_since = None
         except BaseException as error:
             self.health.failure = str(error) or type(error).__name__

@@ -46,7 +46,7 @@ def stamp_of(header: Any) -> Stamp:
     return Stamp(int(header.stamp.sec), int(header.stamp.nanosec), str(header.frame_id))
 
 
-def marker_array(stamp: Stamp, found: Detections | Tracks, *, lifetime_s: float = 0.5) -> Fields:
+def marker_array(stamp: Stamp, detections: Detections | Tracks, *, lifetime_s: float = 0.5) -> Fields:
     """Return a `visualization_msgs/MarkerArray`: deletion of the earlier boxes, then this scan's.
 
     A box is a cube and a text with class and score; of a track the text has the identity, and an arrow says where it
@@ -54,13 +54,13 @@ def marker_array(stamp: Stamp, found: Detections | Tracks, *, lifetime_s: float 
 
     Args:
         stamp: of the scan.
-        found: boxes in its frame, metres, with identities and velocities if they were tracked.
+        detections: boxes in its frame, metres, with identities and velocities if they were tracked.
         lifetime_s: after which RViz removes them if no further scan comes.
     """
     lifetime = {"sec": int(lifetime_s), "nanosec": round(lifetime_s % 1 * 1e9)}
     common: Fields = {"header": stamp.header(), "lifetime": lifetime}
     markers: list[Fields] = [{"header": stamp.header(), "action": _DELETE_ALL}]
-    for number, (box, track) in enumerate(_with_tracks(found)):
+    for number, (box, track) in enumerate(_with_tracks(detections)):
         red, green, blue = class_shares(box.class_name)
         common |= {"id": number, "color": {"r": red, "g": green, "b": blue, "a": 0.4}}
         size = {"x": box.length_m, "y": box.width_m, "z": box.height_m}
@@ -82,12 +82,12 @@ def marker_array(stamp: Stamp, found: Detections | Tracks, *, lifetime_s: float 
     return {"markers": markers}
 
 
-def detection_array(stamp: Stamp, found: Detections | Tracks) -> Fields:
+def detection_array(stamp: Stamp, boxes: Detections | Tracks) -> Fields:
     """Return a `vision_msgs/Detection3DArray`: a detection with class and score for each box, identities of tracks.
 
     Args:
         stamp: of the scan.
-        found: boxes in its frame, metres.
+        boxes: boxes in its frame, metres.
     """
     header = stamp.header()
     detections = [
@@ -102,7 +102,7 @@ def detection_array(stamp: Stamp, found: Detections | Tracks) -> Fields:
             "bbox": {"center": _pose(box), "size": {"x": box.length_m, "y": box.width_m, "z": box.height_m}},
             "id": "" if track is None else str(track[0]),
         }
-        for box, track in _with_tracks(found)
+        for box, track in _with_tracks(boxes)
     ]
     return {"header": header, "detections": detections}
 
@@ -147,10 +147,10 @@ def message_type(kind: str) -> Any:
     return getattr(importlib.import_module(f"{match['package']}.msg"), match["name"])
 
 
-def _with_tracks(found: Detections | Tracks) -> list[tuple[Detection, tuple[int, tuple[float, float]] | None]]:
-    if isinstance(found, Tracks):
-        return [(one.detection, (one.track_id, (one.vx_mps, one.vy_mps))) for one in found]
-    return [(box, None) for box in found]
+def _with_tracks(detections: Detections | Tracks) -> list[tuple[Detection, tuple[int, tuple[float, float]] | None]]:
+    if isinstance(detections, Tracks):
+        return [(one.detection, (one.track_id, (one.vx_mps, one.vy_mps))) for one in detections]
+    return [(box, None) for box in detections]
 
 
 def _pose(box: Detection, *, lift_m: float = 0.0, yaw_rad: float | None = None) -> Fields:

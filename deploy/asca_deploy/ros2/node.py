@@ -120,9 +120,9 @@ def run_node(
 
         publishers: list[Callable[[Stamp, ScanDetections | Tracks], None]] = []
 
-        def answer(stamp: Stamp, found: ScanDetections | Tracks) -> None:
+        def answer(stamp: Stamp, detections: ScanDetections | Tracks) -> None:
             for publish in publishers:
-                publish(stamp, found)
+                publish(stamp, detections)
             if (live.health.answered + 1) % settings.log_every == 0:
                 log("scans", **live.health.summary())
 
@@ -211,9 +211,9 @@ class _Node:
             return None
         kind = publisher.msg_type
 
-        def publish(stamp: Stamp, found: ScanDetections | Tracks) -> None:
+        def publish(stamp: Stamp, detections: ScanDetections | Tracks) -> None:
             if publisher.get_subscription_count():  # messages take longer to be made than boxes to be tracked
-                publisher.publish(filled(kind(), fields_of(stamp, found)))
+                publisher.publish(filled(kind(), fields_of(stamp, detections)))
 
         return publish
 

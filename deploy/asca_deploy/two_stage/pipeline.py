@@ -44,7 +44,7 @@ class PreparedScan(NamedTuple):
 class FirstStageResult(NamedTuple):
     """Outputs of the first stage for one scan."""
 
-    found: FirstStageOutputs
+    outputs: FirstStageOutputs
     points: NDArray[np.float32]
 
 
@@ -94,13 +94,13 @@ class RefinePipeline:
 
     def infer(self, prepared: PreparedScan, stage_times: StageTimes) -> FirstStageResult:
         """Run the first stage's backbone: head maps and the neck's map, or rows of both."""
-        found = self.first.backbone.infer_with_neck(prepared.pillars.placed)
+        outputs = self.first.backbone.infer_with_neck(prepared.pillars.placed)
         stage_times.append(("neck+head", perf_counter()))
-        return FirstStageResult(found, prepared.points)
+        return FirstStageResult(outputs, prepared.points)
 
     def finish(self, raw: FirstStageResult, stage_times: StageTimes) -> Detections:
         """Decode proposals, refine them, and return the boxes that thresholds and rotated NMS keep."""
-        proposed = second_stage_inputs(raw.found, raw.points, self.spec, self.section.seen)
+        proposed = second_stage_inputs(raw.outputs, raw.points, self.spec, self.section.seen)
         stage_times.append(("propose", perf_counter()))
         scan = refine_scan(raw.points, proposed, proposed.proposals, self.section.neighbors, self._executor)
         inputs = refine_inputs(scan)

@@ -63,32 +63,32 @@ def check_pv_rcnn_parity(network: PvRcnn, runtime: PvRcnnPipeline, scans: Sequen
             first = network.propose(batch)
             described, _ = network.encode_keypoints(batch, first.levels, first.canvas)
         levels = dict(zip((*LEVEL_SOURCES, OUT), (level.numpy() for level in first.levels), strict=True))
-        for name, found in runtime.encode(scan).items():
-            worst = max(worst, _require(f"voxels `{name}`", levels[name], found, number))
+        for name, actual in runtime.encode(scan).items():
+            worst = max(worst, _require(f"voxels `{name}`", levels[name], actual, number))
         canvas = VoxelCanvas(spec.level_shapes[-1], first.canvas.shape[3])
         canvas.scatter(levels[OUT], scan.levels[-1].cells)
         worst = max(worst, _require("scatter", first.canvas.numpy(), canvas.image, number))
         maps = HeadMaps(*(part[0].numpy() for part in first.maps))
-        for name, wanted, found in zip(maps._fields, maps, runtime.neck_and_head(canvas.image), strict=True):
-            worst = max(worst, _require(f"head `{name}`", wanted, found, number))
+        for name, expected, actual in zip(maps._fields, maps, runtime.neck_and_head(canvas.image), strict=True):
+            worst = max(worst, _require(f"head `{name}`", expected, actual, number))
         bev = read_map(canvas.rows, scan.bev_cells, scan.bev_weights)
         features = described.numpy()
         places = _places(network, batch, first.levels)
-        for name, found in runtime.deform(scan, levels).items():
-            worst = max(worst, _require(f"deform `{name}`", places[name], found, number))
+        for name, actual in runtime.deform(scan, levels).items():
+            worst = max(worst, _require(f"deform `{name}`", places[name], actual, number))
         # PyTorch's places for both sides: the last bit of one decides which voxels lie in its ball.
-        found = runtime.encode_keypoints(scan, levels, bev, places, balls_around(scan, network.settings, places))
-        worst = max(worst, _require("keypoints", features, found, number))
+        actual = runtime.encode_keypoints(scan, levels, bev, places, balls_around(scan, network.settings, places))
+        worst = max(worst, _require("keypoints", features, actual, number))
         proposals = propose_anchors(maps, spec, network.settings.proposals)
         grid = grid_neighbors(scan.keypoints, proposals.boxes, network.settings, network.settings.vector_cells)
         with torch.inference_mode():
             indices = [torch.from_numpy(part) for part in grid.indices]
             refined = network.refine(batch.keypoints, described, torch.from_numpy(grid.points), indices)
-        ours = refined[0].numpy(), refined[1].numpy()
-        theirs = runtime.refine(scan.keypoints, features, grid)
-        for name, wanted, found in zip(("confidence", "residuals"), ours, theirs, strict=True):
-            worst = max(worst, _require(f"refine `{name}`", wanted, found, number))
-        difference = require_same_refined(proposals, ours, theirs, spec, runtime.scores, number)
+        in_torch = refined[0].numpy(), refined[1].numpy()
+        in_runtime = runtime.refine(scan.keypoints, features, grid)
+        for name, expected, actual in zip(("confidence", "residuals"), in_torch, in_runtime, strict=True):
+            worst = max(worst, _require(f"refine `{name}`", expected, actual, number))
+        difference = require_same_refined(proposals, in_torch, in_runtime, spec, runtime.scores, number)
         worst_box, worst_yaw = max(worst_box, difference.center_size_m), max(worst_yaw, difference.yaw_rad)
     return Parity(worst, worst_box, worst_yaw, require_compared(compared), RELATIVE_TOLERANCE)
 
@@ -97,13 +97,17 @@ def _places(network: PvRcnn, batch: VoxelBatch[torch.Tensor], levels: Sequence[t
     """Return PyTorch's shifted keypoints by the names of the graph's outputs."""
     with torch.inference_mode():
         places = network.deformed_positions(batch, levels)
-    return {f"{name}_place_{number}": each.numpy() for name, own in places.items() for number, each in enumerate(own)}
+    return {
+        f"{name}_place_{number}": each.numpy()
+        for name, indices in places.items()
+        for number, each in enumerate(indices)
+    }
 
 
-def _require(stage: str, expected: Array, found: Array, scan: int) -> float:
+def _require(stage: str, expected: Array, actual: Array, scan: int) -> float:
     """Return the largest difference, relative to the largest value where that is above 1."""
     scale = max(1.0, float(np.abs(expected).max(initial=0.0)))
-    return require_close(stage, expected, found, RELATIVE_TOLERANCE * scale, scan) / scale
+    return require_close(stage, expected, actual, RELATIVE_TOLERANCE * scale, scan) / scale
 
 
 def export_pv_rcnn_bundle(

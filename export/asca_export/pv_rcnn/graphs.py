@@ -231,9 +231,9 @@ def _source_rows(inputs: Mapping[str, Declared], sources: Sequence[SourceBalls])
 
 def _scale_row(name: str) -> str:
     """Return the scale of an input's rows: scale_1 for scale_1_groups and scale_2_nearest, "" for keypoints."""
-    if not (found := re.fullmatch(r"scale_(\d+)_(groups|positions|nearest|nearest_weights)", name)):
+    if not (match := re.fullmatch(r"scale_(\d+)_(groups|positions|nearest|nearest_weights)", name)):
         return ""
-    scale = int(found[1]) - found[2].startswith("nearest")
+    scale = int(match[1]) - match[2].startswith("nearest")
     return f"scale_{scale}" if scale else ""
 
 
@@ -297,5 +297,5 @@ class _Refine(nn.Module):
 
     def forward(self, *inputs: Tensor) -> tuple[Tensor, Tensor]:
         keypoints, features, grid_points, *indices = inputs
-        found: tuple[Tensor, Tensor] = self.head(keypoints, features, grid_points, indices)
-        return found
+        refined: tuple[Tensor, Tensor] = self.head(keypoints, features, grid_points, indices)
+        return refined

@@ -55,7 +55,7 @@ def quantize_pv_rcnn_bundle(
 
     Arguments and errors as of `int8.quantize_bundle`, the network in place of its detector.
     """
-    own = calibration_scans(calibration, scans, bundle.spec)
+    chosen_scans = calibration_scans(calibration, scans, bundle.spec)
     runtime = Detector(folder)
     pipeline = runtime.pipeline
     assert isinstance(pipeline, PvRcnnPipeline), "the bundle has just been exported from PV-RCNN"
@@ -64,7 +64,7 @@ def quantize_pv_rcnn_bundle(
     with tempfile.TemporaryDirectory() as temporary:
         work = Path(shutil.copytree(folder, Path(temporary) / "bundle"))
         progress("Calibrating and rounding the weights")
-        voxels, maps, steps = _round(network, bundle, pipeline, own.used, Path(temporary))
+        voxels, maps, steps = _round(network, bundle, pipeline, chosen_scans.used, Path(temporary))
         eight_bit_form = replace(bundle, precision="int8")
 
         def write(eight_bit: Sequence[str]) -> None:
@@ -77,13 +77,13 @@ def quantize_pv_rcnn_bundle(
             return logit_error(expected, _scores(trial, seen), bundle.spec)
 
         layers = [*voxels.layers, *maps.layers]
-        found = sweep(layers, error_of, progress)
-        write([layer for layer in layers if layer not in found.kept_float])
+        sweep_result = sweep(layers, error_of, progress)
+        write([layer for layer in layers if layer not in sweep_result.kept_float])
         keypoints = scale_bev(onnx.load(graph_path(folder, KEYPOINTS)), steps.scale.numpy())
         onnx.save(keypoints, graph_path(work, KEYPOINTS))
         for name in (VOXELS, BACKBONE, KEYPOINTS):
             shutil.copyfile(graph_path(work, name), graph_path(folder, name))
-    return write_quantized(folder, bundle, found.report(own, len(scans)), boxes, scans)
+    return write_quantized(folder, bundle, sweep_result.report(chosen_scans, len(scans)), boxes, scans)
 
 
 def _round(

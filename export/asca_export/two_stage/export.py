@@ -73,24 +73,24 @@ def check_refine_parity(
     compared = 0
     for number, scan in enumerate(scans):
         points = scan[np.isfinite(scan).all(axis=1)]
-        expected, found = stage(points), runtime.infer(runtime.prepare(points, []), []).found
-        for name, one, other in zip(HeadMaps._fields, expected.maps, found.maps, strict=True):
+        expected, outputs = stage(points), runtime.infer(runtime.prepare(points, []), []).outputs
+        for name, one, other in zip(HeadMaps._fields, expected.maps, outputs.maps, strict=True):
             worst = max(worst, require_close(f"head `{name}`", one, other, MAP_TOLERANCE, number))
         allowed = MAP_TOLERANCE * max(1.0, float(np.abs(expected.neck).max(initial=0.0)))
-        worst = max(worst, require_close("neck", expected.neck, found.neck, allowed, number))
-        proposed = second_stage_inputs(found, points, model.spec, model.refine.seen)
+        worst = max(worst, require_close("neck", expected.neck, outputs.neck, allowed, number))
+        proposed = second_stage_inputs(outputs, points, model.spec, model.refine.seen)
         if not len(proposed.proposals):
             continue
         compared += 1
         asked = refine_scan(points, proposed, proposed.proposals, model.refine.neighbors)
         with torch.inference_mode():
-            wanted = refiner(collate_scans([asked]))
-        ours = wanted.confidence.numpy(), wanted.residuals.numpy()
-        theirs = runtime.refine(refine_inputs(asked))
-        for name, one, other in zip(("confidence", "residuals"), ours, theirs, strict=True):
+            refinements = refiner(collate_scans([asked]))
+        in_torch = refinements.confidence.numpy(), refinements.residuals.numpy()
+        in_runtime = runtime.refine(refine_inputs(asked))
+        for name, one, other in zip(("confidence", "residuals"), in_torch, in_runtime, strict=True):
             worst = max(worst, require_close(f"refine `{name}`", one, other, MAP_TOLERANCE, number))
         scores = model.refine.scores
-        difference = require_same_refined(proposed.proposals, ours, theirs, model.spec, scores, number)
+        difference = require_same_refined(proposed.proposals, in_torch, in_runtime, model.spec, scores, number)
         worst_box, worst_yaw = max(worst_box, difference.center_size_m), max(worst_yaw, difference.yaw_rad)
     return Parity(worst, worst_box, worst_yaw, require_compared(compared), MAP_TOLERANCE)
 
@@ -177,8 +177,8 @@ def _to_int8(
         raise ExportError(f"{eight_bit}: not the 8-bit form of the first stage; export it again")
     threads = default_threads()
     stages = BundleFirstStage(first, threads=threads), BundleFirstStage(eight_bit, threads=threads, precision="int8")
-    wanted, found = ([stage(scan).maps.scores for scan in scans] for stage in stages)
-    error = logit_error(wanted, iter(found), proposing.spec)
+    reference, actual = ([stage(scan).maps.scores for scan in scans] for stage in stages)
+    error = logit_error(reference, iter(actual), proposing.spec)
     if error > MAX_LOGIT_ERROR:
         raise ExportError(
             f"{eight_bit}: its class logits are {error:.3g} from the first stage's, more than {MAX_LOGIT_ERROR}; it is "
@@ -200,9 +200,9 @@ def _neck_gains(
     """Return (C,) factors by which the 8-bit neck's channels come nearest to the float one's, by least squares."""
     products = squares = np.float64(0)
     for scan in calibration:
-        wanted, found = (stage(scan).neck.astype(np.float64) for stage in (floating, eight_bit))
-        axes = tuple(range(wanted.ndim - 1))
-        products, squares = products + (wanted * found).sum(axes), squares + np.square(found).sum(axes)
+        reference, actual = (stage(scan).neck.astype(np.float64) for stage in (floating, eight_bit))
+        axes = tuple(range(reference.ndim - 1))
+        products, squares = products + (reference * actual).sum(axes), squares + np.square(actual).sum(axes)
     silent = squares == 0  # a channel that is zero everywhere
     return np.where(silent, 1, products / np.where(silent, 1, squares)).astype(np.float32)
 

@@ -92,12 +92,12 @@ def _with_output(backbone: onnx.ModelProto, elem_type: int) -> tuple[onnx.ModelP
 def _before_boxes(model: onnx.ModelProto) -> list[onnx.NodeProto]:
     """Return the nodes that the head's boxes depend on, in order; masks of active cells only affect scores."""
     needed = {value.name for value in model.graph.output if value.name != "scores"}
-    found = []
+    nodes = []
     for node in reversed(model.graph.node):
         if needed & set(node.output):
             needed |= set(node.input)
-            found.append(node)
-    return found[::-1]
+            nodes.append(node)
+    return nodes[::-1]
 
 
 def _in_float(model: onnx.ModelProto, steps: str) -> onnx.NodeProto:

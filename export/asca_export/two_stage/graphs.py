@@ -150,9 +150,9 @@ def _grids(settings: RefineSettings) -> list[GroupedBalls[str]]:
 
 
 def _set_abstractions(modules: nn.ModuleList) -> list[SetAbstraction]:
-    found = [module for module in modules if isinstance(module, SetAbstraction)]
-    assert len(found) == len(modules)
-    return found
+    layers = [module for module in modules if isinstance(module, SetAbstraction)]
+    assert len(layers) == len(modules)
+    return layers
 
 
 def export_refine(refiner: PillarRefiner, section: RefineSection, classes: int, path: Path) -> None:

@@ -55,7 +55,7 @@ def ranked(frames: list[EvaluatedFrame], name: str) -> list[tuple[float, int, Bo
     every = [
         (float(score), number, [float(value) for value in box])
         for number, frame in enumerate(frames)
-        for box, kind, score in zip(frame.found, frame.found_types, frame.scores, strict=True)
+        for box, kind, score in zip(frame.detections, frame.detection_types, frame.scores, strict=True)
         if kind == name
     ]
     return sorted(every, key=lambda item: -item[0])

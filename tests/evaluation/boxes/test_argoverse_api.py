@@ -31,10 +31,10 @@ def test_figures_are_the_apis(seed: int, stretch: float) -> None:
 def test_only_the_first_hundred_detections_of_a_frame_count() -> None:
     frame = brute.random_frames(3, frames=1)[0]
     rng = np.random.default_rng(0)
-    crowd = np.repeat(frame.found, 25, axis=0)
+    crowd = np.repeat(frame.detections, 25, axis=0)
     crowd[:, :3] += rng.normal(0, 0.5, (len(crowd), 3))
-    types, scores = [kind for kind in frame.found_types for _ in range(25)], rng.random(len(crowd))
-    many = [replace(frame, found=crowd, found_types=types, scores=scores)]
+    types, scores = [kind for kind in frame.detection_types for _ in range(25)], rng.random(len(crowd))
+    many = [replace(frame, detections=crowd, detection_types=types, scores=scores)]
     assert max(types.count(name) for name in NAMES) > 100
     table = _api_table(many)
     for score in argoverse_scores(many, NAMES):
@@ -47,11 +47,11 @@ def _stretched(frame: EvaluatedFrame, factor: float) -> EvaluatedFrame:
     shift = (factor - 1) * frame.objects[:, :2]
     if not len(shift):
         return frame
-    nearest = np.linalg.norm(frame.found[:, None, :2] - frame.objects[None, :, :2], axis=2).argmin(axis=1)
-    objects, found = frame.objects.copy(), frame.found.copy()
+    nearest = np.linalg.norm(frame.detections[:, None, :2] - frame.objects[None, :, :2], axis=2).argmin(axis=1)
+    objects, found = frame.objects.copy(), frame.detections.copy()
     objects[:, :2] += shift
     found[:, :2] += shift[nearest]
-    return replace(frame, objects=objects, found=found)
+    return replace(frame, objects=objects, detections=found)
 
 
 def _api_table(frames: Sequence[EvaluatedFrame]):
@@ -60,9 +60,9 @@ def _api_table(frames: Sequence[EvaluatedFrame]):
     found_rows, object_rows = [], []
     for frame in frames:
         for name in NAMES:
-            own = np.array(frame.found_types) == name
+            own = np.array(frame.detection_types) == name
             scores = np.asarray(frame.scores)[own]
-            found = np.column_stack([_cuboids(frame.found[own]), scores])
+            found = np.column_stack([_cuboids(frame.detections[own]), scores])
             own = np.array(frame.object_types) == name
             objects = np.column_stack([_cuboids(frame.objects[own]), 3.0 * frame.visible[own]])
             of_found, of_objects = api.accumulate(found, objects, config)

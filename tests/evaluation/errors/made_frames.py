@@ -48,8 +48,8 @@ def frame(
         truncated=np.array([0.0] * len(objects) if truncated is None else truncated),
         object_points=np.array([50] * len(objects) if object_points is None else object_points, np.int64),
         counted=np.array([True] * len(objects) if counted is None else counted, bool),
-        found=np.array([box for *_, box in found], np.float64).reshape(-1, 7),
-        found_types=tuple(kind for kind, *_ in found),
+        detections=np.array([box for *_, box in found], np.float64).reshape(-1, 7),
+        detection_types=tuple(kind for kind, *_ in found),
         scores=np.array([score for _, score, _ in found], np.float64),
         ignored=np.array([False] * len(found) if ignored is None else ignored, bool),
     )

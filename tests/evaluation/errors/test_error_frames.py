@@ -36,7 +36,7 @@ def test_objects_count_within_the_limits_of_moderate(frames: KittiErrorFrames) -
     made = frames.read("000000")
     assert made.types == ("Car", "Car", "Pedestrian", "Cyclist") and made.counted.all() and not made.ignored.any()
     assert (made.object_points > 30).all()
-    np.testing.assert_allclose(made.found, made.objects, atol=1e-3)
+    np.testing.assert_allclose(made.detections, made.objects, atol=1e-3)
     for changes in ({"occluded": 2}, {"truncated": 0.5}, {"bbox": (0.0, 100.0, 50.0, 120.0)}, {"type": "Van"}):
         before = rewritten(frames.labels, **changes)
         assert frames.read("000000").counted.tolist() == [False, True, True, True]
@@ -67,7 +67,7 @@ def test_boxes_are_seen_from_the_sensor(tmp_path: Path) -> None:
     assert reader.frame_ids == ("000000",)
     made = reader.read("000000")
     np.testing.assert_allclose(made.objects[:, :3], boxes[:, :3] - [2.0, 1.0, 0.5], atol=1e-5)
-    np.testing.assert_allclose(made.found[0], made.objects[0])
+    np.testing.assert_allclose(made.detections[0], made.objects[0])
     points = split.points("000000", camera_view=False)[:, :3]
     np.testing.assert_allclose(made.points[:, :3], points - np.array([2.0, 1.0, 0.5]), atol=1e-5)
     assert made.counted.all() and (made.occluded == UNKNOWN_OCCLUSION).all() and made.scores.tolist() == [0.8]

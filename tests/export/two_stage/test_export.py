@@ -113,7 +113,7 @@ def test_the_first_stage_in_eight_bits(
     assert 0 < report.logit_rms_error <= MAX_LOGIT_ERROR
     floating, eight_bit = (Detector(folder, threads=1).pipeline for folder in (trained[1], tmp_path / "a"))
     assert isinstance(floating, RefinePipeline) and isinstance(eight_bit, RefinePipeline)
-    one, other = (each.infer(each.prepare(SCANS[0], []), []).found.neck for each in (floating, eight_bit))
+    one, other = (each.infer(each.prepare(SCANS[0], []), []).outputs.neck for each in (floating, eight_bit))
     stored = {node.name: node for node in onnx.load(tmp_path / "a/refine.onnx").graph.initializer}
     scaled = other * onnx.numpy_helper.to_array(stored["bev.factors"])
     assert other.dtype == np.float32 and 0 < np.abs(one - scaled).mean() < 0.1 * np.abs(one).mean()

@@ -104,8 +104,8 @@ def test_a_batch_is_its_frames_of_which_one_may_be_empty(
         np.testing.assert_allclose(found.boxes, expected.boxes, atol=1e-4)
         np.testing.assert_allclose(found.scores, expected.scores, atol=1e-5)
         np.testing.assert_array_equal(found.labels, expected.labels)
-    confidence = torch.cat([one.found.confidence for one in alone])
-    torch.testing.assert_close(together.found.confidence, confidence, atol=1e-4, rtol=1e-3)
+    confidence = torch.cat([one.refinements.confidence for one in alone])
+    torch.testing.assert_close(together.refinements.confidence, confidence, atol=1e-4, rtol=1e-3)
     assert gradients(detector, batch(detector, *frames))
 
 
@@ -172,8 +172,10 @@ def test_lower_precision_leaves_positions_alone() -> None:
         exact = detector.predict(inputs)
         with torch.autocast("cpu", torch.bfloat16):
             found = detector.predict(inputs)
-    assert found.found.confidence.dtype == torch.float32
-    torch.testing.assert_close(found.found.keypoint_logits, exact.found.keypoint_logits, atol=0.05, rtol=0.05)
+    assert found.refinements.confidence.dtype == torch.float32
+    torch.testing.assert_close(
+        found.refinements.keypoint_logits, exact.refinements.keypoint_logits, atol=0.05, rtol=0.05
+    )
 
 
 def test_learns_one_frame_by_heart() -> None:
