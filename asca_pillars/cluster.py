@@ -302,7 +302,9 @@ class RayPool(Generic[Result]):
         import ray
 
         resources = [node["Resources"] for node in ray.nodes() if node["Alive"]]
-        return any(one.get("CPU", 0) >= self._cpus and one.get("GPU", 0) >= self._gpus for one in resources)
+        return any(
+            resource.get("CPU", 0) >= self._cpus and resource.get("GPU", 0) >= self._gpus for resource in resources
+        )
 
     def submit(self, shard: Shard) -> None:
         """Begin a shard, or let it wait for a free worker."""

@@ -99,7 +99,7 @@ class Variant:
 
     def base_mismatch(self, model: PillarModel) -> str | None:
         """Return why the base does not fit: a row with other thresholds states all classes."""
-        sizes = [[astuple(one)[:_SIZES] for one in classes] for classes in (KITTI_CLASSES, model.spec.classes)]
+        sizes = [[astuple(spec)[:_SIZES] for spec in classes] for classes in (KITTI_CLASSES, model.spec.classes)]
         return "states KITTI's classes" if self.person_ious is not None and sizes[0] != sizes[1] else None
 
     @property
@@ -231,7 +231,7 @@ class TwoStageVariant:
 
     def base_mismatch(self, model: PvRcnnModel) -> str | None:
         """Return why the base does not fit: its sources are other than those that the row states."""
-        sources = [to_dict(one) for one in model.settings.sources]
+        sources = [to_dict(source) for source in model.settings.sources]
         if not sources or sources[0]["source"] != "points":
             return "has balls of raw points, which the base has not"
         others = sources[1:]

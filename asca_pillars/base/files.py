@@ -207,8 +207,8 @@ def _make_folder(folder: Path) -> None:
     missing = [folder]
     while not missing[-1].exists():
         missing.append(missing[-1].parent)
-    for one in reversed(missing):
-        one.mkdir(exist_ok=True)
+    for ancestor in reversed(missing):
+        ancestor.mkdir(exist_ok=True)
 
 
 @contextlib.contextmanager

@@ -92,8 +92,8 @@ def ablate(
     todo = runs(out, parse_seeds(seeds), rows)
     check(rows, config, overrides, data, init)
     require_same_base(out, {"config": to_dict(base), "data": str(data)} | ({} if init is None else {"init": str(init)}))
-    waiting = [load_config(config, [*overrides, *one.variant.overrides]) for one in todo if not one.trained.exists()]
-    if any(one.augment.insert.method != "none" for one in waiting):
+    waiting = [load_config(config, [*overrides, *run.variant.overrides]) for run in todo if not run.trained.exists()]
+    if any(run.augment.insert.method != "none" for run in waiting):
         # Checked once, not by every run.
         with Bars(console) as bars:
             prepare(base, data, workers=default_threads(), reporter=Reporter(bars))

@@ -70,7 +70,7 @@ def require_same_base(out: Path, base: dict[str, Any]) -> None:
 
 def setup(todo: Sequence[Run], config: str, data: Path, lists: DataConfig, jobs: int) -> str:
     """Return the conditions of the numbers: command, data, machine, time, versions."""
-    trained = [json.loads(one.trained.read_text(encoding="utf-8")) for one in todo]
+    trained = [json.loads(run.trained.read_text(encoding="utf-8")) for run in todo]
     hours = sum(record["seconds"] for record in trained) / 3600
     trained_on, checked_on = (len(KittiSplit(data, name).frame_ids) for name in (lists.train_set, lists.val_set))
     note = data / "simulation.json"
@@ -173,12 +173,12 @@ def time_variants(todo: Sequence[Run], family: Family, split: KittiSplit, consol
     from asca_pillars.models.build import load_checkpoint
 
     scans = [read_frame(split, frame_id, ()).points for frame_id in split.frame_ids[:MIN_SCANS]]
-    first = {one.variant.name: one for one in reversed(todo)}  # with several seeds the first one is timed
+    first = {run.variant.name: run for run in reversed(todo)}  # with several seeds the first one is timed
     detectors: dict[str, Detector] = {}
     parameters: dict[str, int] = {}
     with tempfile.TemporaryDirectory() as folder:
-        for name, one in track(first.items(), "Exporting", console=console):
-            checkpoint = load_checkpoint(one.checkpoint)
+        for name, run in track(first.items(), "Exporting", console=console):
+            checkpoint = load_checkpoint(run.checkpoint)
             export_bundle(checkpoint, Path(folder) / name, scans)
             detectors[name] = Detector(Path(folder) / name)
             parameters[name] = sum(part.numel() for part in checkpoint.detector.parameters())

@@ -92,9 +92,9 @@ def measure_parts(
     if parts.compare:
         others = {name: _open_like(detector, folder) for name, folder in list(bundles.items())[1:]}
         compared = compare({next(iter(bundles)): detector} | others, scans, rounds, bar)
-        detections, *other_detections = ([one(points) for points in scans] for one in (detector, *others.values()))
+        detections, *other_detections = ([each(points) for points in scans] for each in (detector, *others.values()))
         boxes = {name: box_difference(detections, other) for name, other in zip(others, other_detections, strict=True)}
-        result["compare"] = asdict(compared) | {"boxes": {name: asdict(one) for name, one in boxes.items()}}
+        result["compare"] = asdict(compared) | {"boxes": {name: asdict(each) for name, each in boxes.items()}}
         console.print(comparison_table(compared, boxes))
     if parts.matrix:
         ways = measure_matrix(bundles, scans, rounds, bar, mounting=detector.mounting, threads=detector.threads)
@@ -186,9 +186,11 @@ def comparison_table(comparison: Comparison, boxes: Mapping[str, BoxDifference] 
     """Return a table of bundles with their speed relative to the first and, if known, the difference of their boxes."""
     title = "; ".join([f"{comparison.rounds} rounds in turn", *([_BOXES] if boxes else [])])
     table = _table(title, "", "p50 ms", "p95 ms", "FPS", "times as fast", *(["boxes"] if boxes else []))
-    for one in comparison.contestants:
+    for bundle in comparison.contestants:
         table.add_row(
-            one.name, *_speed(one), *([_difference_text(boxes[one.name])] if boxes and one.name in boxes else [])
+            bundle.name,
+            *_speed(bundle),
+            *([_difference_text(boxes[bundle.name])] if boxes and bundle.name in boxes else []),
         )
     return table
 
@@ -255,8 +257,13 @@ def _difference_text(boxes: BoxDifference) -> str:
     return f"{100 * boxes.center_size_m:.1f} cm ({boxes.lone})"
 
 
-def _speed(one: Contestant) -> tuple[str, str, str, str]:
-    return f"{one.total_ms.p50:.1f}", f"{one.total_ms.p95:.1f}", f"{one.fps:.1f}", _spread(one.speedup)
+def _speed(bundle: Contestant) -> tuple[str, str, str, str]:
+    return (
+        f"{bundle.total_ms.p50:.1f}",
+        f"{bundle.total_ms.p95:.1f}",
+        f"{bundle.fps:.1f}",
+        _spread(bundle.speedup),
+    )
 
 
 def _spread(ratio: Spread) -> str:

@@ -324,8 +324,8 @@ def _print_scans(result: "DetectedScans", files: Sequence[Path], out: Path, cons
     if detector.candidates:
         console.print(summary(detector.runs_on, detector.candidates), soft_wrap=True)
     asked = len(result) + result.unreadable
-    one = asked == 1
-    console.print(show.boxes(result[0].path, result[0].detections) if one else show.scans(result, detector.spec))
+    is_single = asked == 1
+    console.print(show.boxes(result[0].path, result[0].detections) if is_single else show.scans(result, detector.spec))
     for line in result.remarks:
         show.remark(console, line)
     reports = [scan.detections.report for scan in result]

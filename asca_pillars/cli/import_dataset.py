@@ -87,7 +87,7 @@ def import_dataset(
         raise ConfigError(f"--from {source_format}: no such format; there are {', '.join(FORMATS)}")
     form = FORMATS[source_format]
     if (scans is not None) != form.scans_elsewhere:
-        those = ", ".join(name for name, one in FORMATS.items() if one.scans_elsewhere)
+        those = ", ".join(name for name, layout in FORMATS.items() if layout.scans_elsewhere)
         raise ConfigError(f"--scans FOLDER goes with --from {those}, and only with them: others say where scans are")
     if not source.exists():
         raise ConfigError(f"{source}: no such file or folder; check the path")

@@ -141,7 +141,7 @@ def unlabelled(inspection: ScansInspection) -> Table:
     table.add_row("points not finite", str(inspection.not_finite), "0")
     table.add_row("points within the ranges, %", _spread(share, 1), "")
     table.add_row(
-        "reflectance as stored", ", ".join(f"0 to {one:g}" for one in inspection.reflectance_scales) or "none", ""
+        "reflectance as stored", ", ".join(f"0 to {scale:g}" for scale in inspection.reflectance_scales) or "none", ""
     )
     table.add_row("mean reflectance as read", _spread(inspection.reflectance, 3), f"{dark:.3f} to {bright:.3f}")
     table.add_row("ground near the sensor, z, m", _spread(inspection.ground_z_m, 2), ground)

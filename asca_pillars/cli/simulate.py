@@ -198,7 +198,7 @@ def _report_statistics(out: Path, console: "Console") -> None:
     from asca_pillars.sim.report.reference import kitti_reference
     from asca_pillars.sim.report.tables import print_comparison, write_report
 
-    folder = _claimed(out)
+    folder = _report_folder(out)
     reference = kitti_reference()
     with Bars(console) as bars:
         measured = measure(out, reporter=Reporter(bars))
@@ -216,7 +216,7 @@ def _report_like_for_like(out: Path, like: Path, bundle: Path | None, console: "
     from asca_pillars.sim.report.like_for_like import MIN_SCORE, compare_like_for_like
     from asca_pillars.sim.report.like_tables import print_like, write_like
 
-    folder = _claimed(out)
+    folder = _report_folder(out)
     detect = None if bundle is None else open_model(RuntimeOptions(bundle=bundle), MIN_SCORE).detect
     with Bars(console) as bars:
         name = None if bundle is None else str(bundle)
@@ -226,7 +226,7 @@ def _report_like_for_like(out: Path, like: Path, bundle: Path | None, console: "
     console.print(f"Written: {folder}/like_for_like.md, .json and .png", soft_wrap=True)
 
 
-def _claimed(out: Path) -> Path:
+def _report_folder(out: Path) -> Path:
     """Return the folder of the reports, which may contain earlier ones only; else OutputError names the first other."""
     from asca_pillars.base.own_files import ending_with, is_own_picture, json_object, require_no_link, require_own
     from asca_pillars.sim.report.tables import PAGE_END

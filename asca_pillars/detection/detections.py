@@ -131,7 +131,7 @@ class ScanCounts:
 def sum_counts(counts: Sequence[ScanCounts]) -> ScanCounts:
     """Sum the counts of a scan's passes, all of one family."""
     first = counts[0]
-    return type(first)(**{name.name: sum(getattr(one, name.name) for one in counts) for name in fields(first)})
+    return type(first)(**{name.name: sum(getattr(part, name.name) for part in counts) for name in fields(first)})
 
 
 @dataclass(frozen=True)

@@ -127,30 +127,30 @@ def _match_by_overlap(
 def _match_nearest(
     anchors: NDArray[np.float32], boxes: NDArray[np.float32], labels: NDArray[np.int64], box_rows: NDArray[np.int64]
 ) -> _Matches:
-    claims = [_Claims(np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0))]
-    claims += [_claims(anchors, boxes[row], labels[row], row) for row in box_rows]
-    places, claimants, weights = (np.concatenate(parts) for parts in zip(*claims, strict=True))
+    matches = [_AtssMatches(np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0))]
+    matches += [_atss_matches(anchors, boxes[row], labels[row], row) for row in box_rows]
+    places, matched_rows, weights = (np.concatenate(parts) for parts in zip(*matches, strict=True))
     order = np.lexsort((weights, places))
-    places, claimants = places[order], claimants[order]
+    places, matched_rows = places[order], matched_rows[order]
     strongest = np.diff(places, append=-1) != 0  # the last one at each place
-    positives, matched = places[strongest], claimants[strongest]
+    positives, matched = places[strongest], matched_rows[strongest]
     state = np.zeros(anchors.shape[:3], np.int8)
     state.reshape(-1)[positives] = 1
     return _Matches(state, positives, matched)
 
 
-class _Claims(NamedTuple):
+class _AtssMatches(NamedTuple):
     """Anchors matched with a box by ATSS."""
 
     places: NDArray[np.int64]
     """(n,) flat indices into (H, W, A)."""
-    claimants: NDArray[np.int64]
+    matched_rows: NDArray[np.int64]
     """(n,) row of the box."""
     weights: NDArray[np.float64]
     """(n,) weights; of several boxes that match an anchor, the one with the greatest weight has it."""
 
 
-def _claims(anchors: NDArray[np.float32], box: NDArray[np.float32], label: int, box_index: int) -> _Claims:
+def _atss_matches(anchors: NDArray[np.float32], box: NDArray[np.float32], label: int, box_index: int) -> _AtssMatches:
     row, column = _nearest_cells(anchors, box)
     near = anchors[row, column, _anchors_of(label)]  # (9, 2, 7)
     iou = aligned_bev_iou(near.reshape(-1, 7), box[None]).reshape(near.shape[:2]).astype(np.float64)
@@ -160,7 +160,7 @@ def _claims(anchors: NDArray[np.float32], box: NDArray[np.float32], label: int, 
     cell, yaw = np.nonzero((iou > 0) & (best | (inside & (iou >= iou.mean() + iou.std()))))
     anchor = _anchors_of(label).start + yaw
     places = np.ravel_multi_index((row[cell], column[cell], anchor), anchors.shape[:3])
-    return _Claims(places, np.full(len(places), box_index), iou[cell, yaw] + best[cell, yaw])
+    return _AtssMatches(places, np.full(len(places), box_index), iou[cell, yaw] + best[cell, yaw])
 
 
 def _nearest_cells(

@@ -346,7 +346,7 @@ def _with_distinct_names(
     """Return both detectors named by their models, or by their folders if these are the same."""
     named = [replace(evaluated, name=_name(task.about, task.predictions)), other]
     if named[0].name == named[1].name:
-        named = [replace(one, name=f"{one.name}, {one.predictions}") for one in named]
+        named = [replace(detector, name=f"{detector.name}, {detector.predictions}") for detector in named]
     return named
 
 

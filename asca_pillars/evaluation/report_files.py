@@ -141,8 +141,8 @@ def write_gallery(
     else:
         first, second = detectors
         chosen = [*most_different_frames(first.frames, second.frames, count)]
-        words, kinds = _DIFFERENT, [(f"missed, {one.name}", f"false, {one.name}") for one in detectors]
-    title = " and ".join(one.name for one in detectors)
+        words, kinds = _DIFFERENT, [(f"missed, {detector.name}", f"false, {detector.name}") for detector in detectors]
+    title = " and ".join(detector.name for detector in detectors)
     cards = []
     bar = reporter.track(chosen, "Drawing")
     for rank, matches in enumerate(bar, start=1):
@@ -154,8 +154,8 @@ def write_gallery(
             values["errors"] = matches[0].errors
         else:
             values["difference"] = _difference(*matches)
-        for (missed, false), one in zip(kinds, matches, strict=True):
-            values |= {missed: int(one.missed.sum()), false: int(one.false_positive.sum())}
+        for (missed, false), detector in zip(kinds, matches, strict=True):
+            values |= {missed: int(detector.missed.sum()), false: int(detector.false_positive.sum())}
         cards.append(GalleryCard(frame_id, PurePath(name), values))
     page = gallery_page(f"{title}: {words['which']}", _INTRODUCTION.format(**words), cards, None, end=INDEX_END)
     write_text(Path(folder) / INDEX, page)
@@ -175,7 +175,7 @@ def _draw(
     image = read_image(split.image_path(frame_id))
     truth = read_labels(labels / f"{frame_id}.txt")
     detections = [read_labels(detector.predictions / f"{frame_id}.txt") for detector in detectors]
-    layers = [_layers(one, truth, own, calibration) for one, own in zip(matches, detections, strict=True)]
+    layers = [_layers(match, truth, own, calibration) for match, own in zip(matches, detections, strict=True)]
     every_box = np.concatenate([layer.boxes for own in layers for layer in own])
     panels = []
     for detector, own in zip(detectors, layers, strict=True):

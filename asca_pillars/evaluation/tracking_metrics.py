@@ -186,7 +186,7 @@ def _matches(frame: TrackedFrame, before: dict[int, int], threshold: float) -> d
     """Match a frame: object -> identity."""
     similarity = np.where(frame.similarity >= threshold, frame.similarity, 0.0)
     kept = np.array(
-        [[before.get(one) == other for other in frame.detections.tolist()] for one in frame.objects.tolist()]
+        [[before.get(item) == identity for identity in frame.detections.tolist()] for item in frame.objects.tolist()]
     )
     if similarity.size:
         kept = kept.reshape(similarity.shape) & (similarity > 0)

@@ -68,7 +68,7 @@ class TrackingReport:
     @property
     def counted(self) -> int:
         """Number of counted labels."""
-        return sum(one.clear.labels for one in self.scores)
+        return sum(score.clear.labels for score in self.scores)
 
 
 @dataclass(frozen=True)
@@ -104,7 +104,7 @@ def tracking_report(split: BoxSplit, predictions: Path, subject: str, about: dic
     path = predictions / "detections.jsonl" if predictions.is_dir() else predictions
     by_frame = predictions_by_frame(path, split)
     scope = stated_scope(path, by_frame.values())
-    predicted = sorted({kind for one in by_frame.values() for kind in one.records.types})
+    predicted = sorted({kind for records in by_frame.values() for kind in records.records.types})
     names = tuple(dict.fromkeys((*(() if scope is None else scope.classes), *predicted)))
     sequences: dict[str, list[_Frame]] = {}
     labelled: Counter[str] = Counter()
@@ -127,7 +127,7 @@ def tracking_report(split: BoxSplit, predictions: Path, subject: str, about: dic
 
 def tracking_tables(report: TrackingReport) -> list[TextTable]:
     """Return the tables of HOTA with its parts, and of MOTA with its counts; a row for each class."""
-    parts = [(one.name, *(f"{100 * value:.1f}" for value in one.hota)) for one in report.scores]
+    parts = [(score.name, *(f"{100 * value:.1f}" for value in score.hota)) for score in report.scores]
     counts = [
         (
             name,
@@ -178,16 +178,16 @@ def _counted_note(report: TrackingReport) -> str:
 def tracking_json(report: TrackingReport) -> dict[str, Any]:
     """Return all numbers; None for those that cannot be computed."""
     classes = {
-        one.name: {
+        score.name: {
             key: None if isinstance(value, float) and np.isnan(value) else value
             for key, value in {
-                **one.hota._asdict(),
-                **one.clear._asdict(),
-                "misses": one.clear.misses,
-                "mota": one.clear.mota,
+                **score.hota._asdict(),
+                **score.clear._asdict(),
+                "misses": score.clear.misses,
+                "mota": score.clear.mota,
             }.items()
         }
-        for one in report.scores
+        for score in report.scores
     }
     return report.about | {
         "subject": report.subject,

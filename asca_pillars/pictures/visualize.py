@@ -151,7 +151,7 @@ def draw_layers(
     for layer, layer_outlines in zip(layers, outlines, strict=True):
         for outline, text in zip(layer_outlines, layer.texts, strict=bool(layer.texts)):
             if view.shows(view.pixels(outline.mean(axis=0))):
-                _put_beside(texts, view.pixels(outline), text, layer.color)
+                _put_text(texts, view.pixels(outline), text, layer.color)
     size = (view.width_px // OVERSAMPLING, view.height_px // OVERSAMPLING)
     return np.asarray(cv2.resize(canvas, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
 
@@ -251,7 +251,7 @@ def _draw_footprint(canvas: Image, outline: NDArray[np.float64], color: Color, t
         cv2.polylines(canvas, [subpixels(line)], closed, color, thickness, cv2.LINE_AA, SUBPIXEL_BITS)
 
 
-def _put_beside(texts: Texts, outline: NDArray[np.float64], text: str, color: Color) -> None:
+def _put_text(texts: Texts, outline: NDArray[np.float64], text: str, color: Color) -> None:
     (left, top), (right, bottom) = outline.min(axis=0), outline.max(axis=0)
     width, height = texts.size(text)
     middle = (top + bottom + height) / 2

@@ -163,7 +163,7 @@ def estimate_height(scans: Iterable[NDArray[Any]], mounting: Mounting | None = N
     Raises:
         ScanError: no scan shows a clear ground, or the scans contradict each other; says how.
     """
-    return estimate_named_height((NamedPoints(f"scan {n}", one) for n, one in enumerate(scans, start=1)), mounting)
+    return estimate_named_height((NamedPoints(f"scan {n}", scan) for n, scan in enumerate(scans, start=1)), mounting)
 
 
 def estimate_named_height(

@@ -138,10 +138,12 @@ def common_reflectance_scale(stored: Sequence[StoredPoints]) -> FolderScale:
 
     Auto where none of them has reflectances; scans without points are ignored.
     """
-    samples = [(one.reflectance, one.dtype) for one in stored if one.reflectance is not None and has_finite_point(one)]
+    samples = [
+        (scan.reflectance, scan.dtype) for scan in stored if scan.reflectance is not None and has_finite_point(scan)
+    ]
     if not samples:
         return FolderScale("auto", None)
-    decided = [decide_scale(*one) for one in samples]
+    decided = [decide_scale(*scan) for scan in samples]
     scale = max(scale for scale, _ in decided)
     guessed = any(by_values for _, by_values in decided)
     doubts = [ambiguity(values, scale) for values, _ in samples] if guessed else [None]

@@ -23,13 +23,13 @@ class Transforms:
 
     def add(self, message: Any) -> None:
         """Store the transforms of a `tf2_msgs/TFMessage`, except those that are not a rotation and translation."""
-        for one in message.transforms:
-            shift, turn = one.transform.translation, one.transform.rotation
+        for transform in message.transforms:
+            shift, turn = transform.transform.translation, transform.transform.rotation
             matrix = np.eye(4)
             matrix[:3, :3] = rotations_from_quaternions(np.array([turn.w, turn.x, turn.y, turn.z]))
             matrix[:3, 3] = shift.x, shift.y, shift.z
             if np.isfinite(matrix).all():
-                self._parents[_plain(one.child_frame_id)] = _plain(one.header.frame_id), matrix
+                self._parents[_plain(transform.child_frame_id)] = _plain(transform.header.frame_id), matrix
 
     def between(self, source: str, target: str) -> NDArray[np.float64] | None:
         """Return the (4, 4) matrix, metres, from one frame to another; None if they are not connected."""
@@ -69,9 +69,9 @@ def read_static_transforms(recording: Recording, frame: str) -> Transforms:
     """
     instead = "say how the scans lie by --axes or --pose instead of --frame"
     topics = [
-        one.name
-        for one in recording.topics
-        if one.name.rpartition("/")[2] == _STATIC and one.type in TRANSFORM_TYPES and one.messages
+        listed.name
+        for listed in recording.topics
+        if listed.name.rpartition("/")[2] == _STATIC and listed.type in TRANSFORM_TYPES and listed.messages
     ]
     if not topics:
         raise ScanError(f"{recording.path}: no messages on /{_STATIC} (tf2_msgs/msg/TFMessage); {instead}")
@@ -138,7 +138,7 @@ def read_poses(recording: Recording, topic: str) -> Poses:
     Raises:
         ScanError: there is no such topic, it holds something else, or none of its poses can be used.
     """
-    kinds = {one.name: one.type for one in recording.topics}
+    kinds = {listed.name: listed.type for listed in recording.topics}
     if kinds.get(topic) not in ODOMETRY_TYPES:
         odometry_topics = ", ".join(name for name, kind in kinds.items() if kind in ODOMETRY_TYPES) or "no such topic"
         raise ScanError(f"{recording.path}: {topic[:80]} holds no nav_msgs/msg/Odometry; there is {odometry_topics}")

@@ -264,7 +264,7 @@ def draw_moving_scene(
         ego, going = draw_trajectories(targets, placer.ground, placer.kind, duration_s, rng_of_ways)
         kept = [item.target for item in going]
         placer.targets[:] = kept
-        placer.half_hidden[:] = [target for target in placer.half_hidden if any(target is one for one in kept)]
+        placer.half_hidden[:] = [target for target in placer.half_hidden if any(target is other for other in kept)]
         for way, size in [(ego, KEPT_CLEAR_M), *((way, _size(target)) for target, way in going)]:
             for footprint in held_footprints(way, size, duration_s):
                 placer.occupied.hold(*footprint)

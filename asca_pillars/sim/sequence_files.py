@@ -141,12 +141,12 @@ def simulate_sequences(
         config = replace(config, field_of_view="around")
     plan = SequencePlan(seed, length, config)
     record_settings(root, {"seed": seed, "length": length, "rate_hz": RATE_HZ, **asdict(config)}, root / "scans")
-    todo = [(one, index) for one in range(sequences) for index in range(length)]
+    todo = [(sequence, index) for sequence in range(sequences) for index in range(length)]
     todo = [item for item in todo if not _scan_path(root, *item).exists()]
     for_each(partial(_write_frame, root, plan), todo, workers, reporter)
     first_val = sequences - held_out(sequences, val_share)
     for name, numbers in (("train", range(first_val)), ("val", range(first_val, sequences))):
-        write_image_set(root, name, [f"{one:04d}/{index:06d}" for one in numbers for index in range(length)])
+        write_image_set(root, name, [f"{sequence:04d}/{index:06d}" for sequence in numbers for index in range(length)])
     write_text(root / DATASET_FILE, _DATASET)
     return root
 

@@ -151,9 +151,9 @@ def outside_image(firings: Firings, calib: Calibration) -> npt.NDArray[np.bool_]
     cos, sin = np.cos(firings.azimuth_rad), np.sin(firings.azimuth_rad)
     phase = np.stack([np.cos(firings.phase_rad), np.sin(firings.phase_rad)], axis=1)
     outside = np.zeros((len(firings.slope), len(cos)), bool)
-    for x, y, z, one in planes:
+    for x, y, z, offset in planes:
         # Along a ray the product is start + rise * distance: positive at both ends if the rise exceeds -start / each.
-        start, rise = z * firings.origin_z_m + one, phase @ np.stack([x * cos + y * sin, y * cos - x * sin])
+        start, rise = z * firings.origin_z_m + offset, phase @ np.stack([x * cos + y * sin, y * cos - x * sin])
         least = (-start / ends_m).max(axis=0) - z * firings.slope
         outside |= rise > least[:, None]
     return outside

@@ -42,7 +42,7 @@ from asca_pillars.training.dataset import require_boxes
 from asca_pillars.training.loaders import DetectionData
 from asca_pillars.training.module import DetectionModule, has_bfloat16, resolve_precision
 from asca_pillars.training.run_files import COMMAND
-from asca_pillars.training.run_folder import TrainingInputs, claim_run_folder, measure_input, recorded_precision
+from asca_pillars.training.run_folder import TrainingInputs, measure_input, prepare_run_folder, recorded_precision
 
 SANITY_STEPS = 2  # validation batches that run before the first training step
 
@@ -133,7 +133,7 @@ def _train(
             reporter.remark(warning)
     data = DetectionData(config, data_root, reporter)
     inputs = TrainingInputs.of(data.training_set.frames.split, trainer.world_size, weights)
-    claim_run_folder(out, config, inputs, steps_of(resumed))
+    prepare_run_folder(out, config, inputs, steps_of(resumed))
     if damage is not None and goes_on:
         reporter.remark(f"{damage}: resuming from {resumed}")
     if config.train.precision == "bf16" and not has_bfloat16():

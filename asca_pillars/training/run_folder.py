@@ -64,7 +64,7 @@ class TrainingInputs(NamedTuple):
         return cls(len(sizes), hashlib.sha256("\n".join(sizes).encode()).hexdigest(), processes, start)
 
 
-def claim_run_folder(out: Path, config: Config, inputs: TrainingInputs, steps: int = 0) -> None:
+def prepare_run_folder(out: Path, config: Config, inputs: TrainingInputs, steps: int = 0) -> None:
     """Write what this run is into `out`, or make sure that the run found there is the same one.
 
     A run may be made longer where its steps so far are those of the longer run: always with the `step` schedule, and
@@ -117,7 +117,7 @@ def measure_input(out: Path, frames: TrainingFrames, *, keep: bool, reporter: Re
     count = min(len(ids), EXPECTED_INPUT_FRAMES)
     spaced = [ids[i * len(ids) // count] for i in range(count)]
     chosen = reporter.track(spaced, "Measuring training scans")
-    scans = (read_frame(frames.split, one, (), camera_view=frames.camera_view).points for one in chosen)
+    scans = (read_frame(frames.split, frame_id, (), camera_view=frames.camera_view).points for frame_id in chosen)
     try:
         measured = measure_expected_input(scans, frames.camera_view)
     except ValueError:

@@ -91,7 +91,7 @@ def write_page(out: Path, bundle: Path, scan: Path, ort_web: Path) -> int:
             "bundle": manifest.name,
             "scan": scan.name,
             "onnxruntime_web": version,
-            "colors": color_table(one.name for one in manifest.spec.classes),
+            "colors": color_table(class_spec.name for class_spec in manifest.spec.classes),
             "heights": height_table(),
             "files": files,
         }

@@ -267,7 +267,7 @@ class Detector:
         def infer(ready: tuple[_Frame, list[Any]]) -> tuple[_Frame, list[Any]]:
             frame, prepared = ready
             frame.stage_times.append((_WAITING, perf_counter()))
-            return frame, [self.pipeline.infer(one, frame.stage_times) for one in prepared]
+            return frame, [self.pipeline.infer(each, frame.stage_times) for each in prepared]
 
         def finish(detections: tuple[_Frame, list[Any]]) -> ScanDetections:
             frame, raw = detections
@@ -301,9 +301,9 @@ class Detector:
         return prepared
 
     def _finish(self, frame: _Frame, raw: list[Any]) -> ScanDetections:
-        passes = [self.pipeline.finish(one, frame.stage_times) for one in raw]
+        passes = [self.pipeline.finish(each, frame.stage_times) for each in raw]
         if self.view == "around":
-            passes = [without_own_vehicle(one) for one in passes]
+            passes = [without_own_vehicle(each) for each in passes]
         if self.passes == 1:
             detections, counts = passes[0], frame.counts[0]
         else:

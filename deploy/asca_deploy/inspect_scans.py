@@ -146,15 +146,15 @@ def inspect_scans(
     frame_ids: dict[str, None] = {}
     fields: tuple[str, ...] = ()
     error_texts: list[str] = []
-    for one in reporter.track(source.scans, "Inspecting", source.to_read):
-        if one.scan is None:
-            error_texts.append(str(one.error_text))
+    for scan in reporter.track(source.scans, "Inspecting", source.to_read):
+        if scan.scan is None:
+            error_texts.append(str(scan.error_text))
             continue
-        times.append((one.number, one.time_ns))
-        frame_ids[one.frame_id] = None
-        fields = fields or one.fields
-        if one.number % source.step == 0:
-            measured.add(source.name(one.number), one.scan)
+        times.append((scan.number, scan.time_ns))
+        frame_ids[scan.frame_id] = None
+        fields = fields or scan.fields
+        if scan.number % source.step == 0:
+            measured.add(source.name(scan.number), scan.scan)
     recorded = source.recorded
     damage = recorded.recording.damage if recorded else None
     if not times:

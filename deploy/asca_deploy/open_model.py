@@ -117,7 +117,7 @@ def track_thresholds(bundle: str | Path | None, score: ScoreThresholds | None = 
     """
     spec = load_bundle(find_bundle(bundle)).spec
     spec = spec if score is None else spec.with_score_threshold(score)
-    births = {one.name: one.score_threshold for one in spec.classes}
+    births = {class_spec.name: class_spec.score_threshold for class_spec in spec.classes}
     return births, WEAK_SHARE * min(births.values())
 
 

@@ -96,7 +96,7 @@ class ScanServer:
         scan_input = ScanInput(reading, paths)
         around = files_need_around(options, scan_input) if around is None else around
         detector = open_detector(options, score, scan_input.mounting, around=around)
-        thresholds = {one.name: one.score_threshold for one in detector.spec.classes}
+        thresholds = {class_spec.name: class_spec.score_threshold for class_spec in detector.spec.classes}
         lowest = {
             name: min(value, LOWEST_SCORE) if detector.passes == 1 else value for name, value in thresholds.items()
         }

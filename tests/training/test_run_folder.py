@@ -18,7 +18,7 @@ from asca_pillars.data.kitti import KittiSplit
 from asca_pillars.training import loop
 from asca_pillars.training.loop import train
 from asca_pillars.training.run_files import YAML_HEAD, require_own_run
-from asca_pillars.training.run_folder import TrainingInputs, claim_run_folder, measure_input
+from asca_pillars.training.run_folder import TrainingInputs, measure_input, prepare_run_folder
 from tests.helpers.in_process import run_here
 from tests.helpers.scenes import write_dataset
 from tests.helpers.tiny_run import CONFIG, with_train
@@ -35,21 +35,21 @@ def learn(run: Path) -> None:
 
 
 def test_a_run_is_the_same_with_other_workers_folders_and_intervals(tmp_path: Path) -> None:
-    claim_run_folder(tmp_path, CONFIG, SEEN)
+    prepare_run_folder(tmp_path, CONFIG, SEEN)
     data = DataConfig(workers=7, prepared=str(tmp_path))
     recipe = dataclasses.replace(CONFIG.train, checkpoint_steps=9)
-    claim_run_folder(tmp_path, dataclasses.replace(CONFIG, data=data, train=recipe), SEEN)
+    prepare_run_folder(tmp_path, dataclasses.replace(CONFIG, data=data, train=recipe), SEEN)
     learn(tmp_path)
     with pytest.raises(TrainingError, match=r"data\.min_points = 1, now data\.min_points = 2"):
-        claim_run_folder(tmp_path, dataclasses.replace(CONFIG, data=DataConfig(min_points=2)), SEEN)
+        prepare_run_folder(tmp_path, dataclasses.replace(CONFIG, data=DataConfig(min_points=2)), SEEN)
 
 
 def test_a_run_goes_on_with_its_own_frames_processes_and_first_weights_alone(tmp_path: Path) -> None:
-    claim_run_folder(tmp_path, CONFIG, SEEN)
-    claim_run_folder(tmp_path, CONFIG, TrainingInputs(2, "ac", 1, "first"))  # nothing is learnt yet
+    prepare_run_folder(tmp_path, CONFIG, SEEN)
+    prepare_run_folder(tmp_path, CONFIG, TrainingInputs(2, "ac", 1, "first"))  # nothing is learnt yet
     learn(tmp_path)
     for start in ("first", None, "first"):  # the command is given again, with --init or without it
-        claim_run_folder(tmp_path, CONFIG, TrainingInputs(2, "ac", 1, start))
+        prepare_run_folder(tmp_path, CONFIG, TrainingInputs(2, "ac", 1, start))
     for other, message in (
         (TrainingInputs(3, "abc", 1), r"frames\.json: .* on 2 frames, now there are 3, or others; give"),
         (TrainingInputs(2, "ab", 1), r"frames\.json: .* on 2 frames, now there are 2, or others; give"),
@@ -57,17 +57,17 @@ def test_a_run_goes_on_with_its_own_frames_processes_and_first_weights_alone(tmp
         (TrainingInputs(2, "ac", 1, "other"), r"was started from other weights; leave --init out"),
     ):
         with pytest.raises(TrainingError, match=message):
-            claim_run_folder(tmp_path, CONFIG, other)
+            prepare_run_folder(tmp_path, CONFIG, other)
     (tmp_path / "frames.json").write_text("{")
     with pytest.raises(ConfigError, match=r"frames\.json: not valid YAML"):
-        claim_run_folder(tmp_path, CONFIG, SEEN)
+        prepare_run_folder(tmp_path, CONFIG, SEEN)
     (tmp_path / "expected_input.yaml").write_text("points_per_scan: [")
     with pytest.raises(ConfigError, match=r"expected_input\.yaml: not valid YAML: "):
         measure_input(tmp_path, cast(Any, None), keep=True)  # no frame is asked where something was kept
     (tmp_path / "frames.json").unlink()  # an older version wrote none
-    claim_run_folder(tmp_path, CONFIG, SEEN._replace(initial_sha256=""))
+    prepare_run_folder(tmp_path, CONFIG, SEEN._replace(initial_sha256=""))
     with pytest.raises(TrainingError, match=r"was started from random weights; leave --init out"):
-        claim_run_folder(tmp_path, CONFIG, SEEN._replace(initial_sha256="other"))
+        prepare_run_folder(tmp_path, CONFIG, SEEN._replace(initial_sha256="other"))
 
 
 def test_inputs_are_known_by_the_sizes_of_their_scans_and_the_weights(tmp_path: Path) -> None:
@@ -82,7 +82,7 @@ def test_inputs_are_known_by_the_sizes_of_their_scans_and_the_weights(tmp_path: 
 
 def test_a_run_on_other_data_is_refused_before_it_begins(tmp_path: Path) -> None:
     data = write_dataset(tmp_path / "data", 3)
-    claim_run_folder(tmp_path / "run", CONFIG, SEEN)
+    prepare_run_folder(tmp_path / "run", CONFIG, SEEN)
     (tmp_path / "run" / "checkpoints").mkdir()
     (tmp_path / "run" / "checkpoints" / "best.ckpt").touch()
     with pytest.raises(TrainingError, match=r"frames\.json: .* started on 2 frames, now there are 2, or others"):
@@ -96,12 +96,12 @@ def test_a_run_may_be_made_longer_where_its_schedule_allows(tmp_path: Path) -> N
     stable = {"schedule": "warmup_stable_decay", "cooldown": 0.25}
     seen = TrainingInputs(10, "ab", 1)  # ten steps an epoch: of four stable epochs the last ten steps fall
     step, cycle, falling = (tmp_path / name for name in ("step", "cycle", "falling"))
-    claim_run_folder(step, of(epochs=2, schedule="step"), seen)
-    claim_run_folder(cycle, of(epochs=2, schedule="one_cycle"), seen)
-    claim_run_folder(falling, of(epochs=4, **stable), seen)
+    prepare_run_folder(step, of(epochs=2, schedule="step"), seen)
+    prepare_run_folder(cycle, of(epochs=2, schedule="one_cycle"), seen)
+    prepare_run_folder(falling, of(epochs=4, **stable), seen)
     for folder in (step, cycle, falling):
         learn(folder)
-    claim_run_folder(step, of(epochs=5, schedule="step"), seen)
+    prepare_run_folder(step, of(epochs=5, schedule="step"), seen)
     for folder, config, message in (
         (step, of(epochs=4, schedule="step"), r"train\.epochs = 5, now train\.epochs = 4; choose another"),
         (step, of(epochs=9, schedule="step", seed=1), r"config\.yaml: .* train\.seed = 0, now train\.seed = 1"),
@@ -109,16 +109,16 @@ def test_a_run_may_be_made_longer_where_its_schedule_allows(tmp_path: Path) -> N
         (falling, of(epochs=8, **stable), r"fallen since step 30 of 40: start .*--init .*last\.ckpt"),
     ):
         with pytest.raises(TrainingError, match=message):
-            claim_run_folder(folder, config, seen, steps=31)
-    claim_run_folder(falling, of(epochs=8, **stable), seen, steps=30)
+            prepare_run_folder(folder, config, seen, steps=31)
+    prepare_run_folder(falling, of(epochs=8, **stable), seen, steps=30)
 
 
 def test_a_run_that_learnt_nothing_gives_way(tmp_path: Path) -> None:
     """The corrected command may be given again, and nothing of the mistaken one stays."""
-    claim_run_folder(tmp_path, CONFIG, SEEN)
+    prepare_run_folder(tmp_path, CONFIG, SEEN)
     (tmp_path / "environment.json").write_text("of the mistaken run")
     other = dataclasses.replace(CONFIG, data=DataConfig(min_points=2))
-    claim_run_folder(tmp_path, other, SEEN)
+    prepare_run_folder(tmp_path, other, SEEN)
     text = (tmp_path / "config.yaml").read_text()
     assert text.startswith(YAML_HEAD) and yaml.safe_load(text) == to_dict(other)
     assert "torch" in (tmp_path / "environment.json").read_text()
@@ -140,14 +140,14 @@ def test_a_run_of_an_older_version_goes_on(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match=r"config\.yaml"):
         require_own_run(tmp_path)
     path.write_text(text)
-    claim_run_folder(tmp_path, CONFIG, SEEN)
+    prepare_run_folder(tmp_path, CONFIG, SEEN)
 
 
 def test_a_folder_in_which_another_process_trains_is_left_to_it(tmp_path: Path) -> None:
     """Before its first checkpoint, too, when its files could be taken for those of a run that never began."""
     data = write_dataset(tmp_path / "data", 3)
     with only_writer(tmp_path / "run", "asca train"):
-        claim_run_folder(tmp_path / "run", CONFIG, SEEN)
+        prepare_run_folder(tmp_path / "run", CONFIG, SEEN)
         with pytest.raises(OutputError, match=r"run: another `asca train` is at work there; let it end"):
             train(with_train(seed=1), data, tmp_path / "run")
         assert yaml.safe_load((tmp_path / "run" / "config.yaml").read_text()) == to_dict(CONFIG)
@@ -188,7 +188,7 @@ def test_a_configuration_of_the_user_is_not_replaced(tmp_path: Path, content: st
 
 
 def test_nor_is_one_that_is_put_into_the_folder_of_a_run(tmp_path: Path) -> None:
-    claim_run_folder(tmp_path, CONFIG, SEEN)
+    prepare_run_folder(tmp_path, CONFIG, SEEN)
     require_own_run(tmp_path)
     for name in ("config.yaml", "expected_input.yaml", "environment.json", "frames.json"):
         before = (tmp_path / name).read_text() if (tmp_path / name).exists() else None
@@ -198,12 +198,12 @@ def test_nor_is_one_that_is_put_into_the_folder_of_a_run(tmp_path: Path) -> None
         (tmp_path / name).unlink() if before is None else (tmp_path / name).write_text(before)
     (tmp_path / "config.yaml").write_text(USERS["commented"])
     with pytest.raises(OutputError, match=r"config\.yaml: `asca train` did not write it"):
-        claim_run_folder(tmp_path, CONFIG, SEEN)  # from Python
+        prepare_run_folder(tmp_path, CONFIG, SEEN)  # from Python
 
 
 def test_nothing_is_trained_through_links_or_over_the_weights_to_start_from(tmp_path: Path) -> None:
     run = tmp_path / "run"
-    claim_run_folder(run, CONFIG, SEEN)
+    prepare_run_folder(run, CONFIG, SEEN)
     learn(run)
     last = run / "checkpoints" / "last.ckpt"
     require_own_run(run, "asca_sim")
@@ -224,7 +224,7 @@ def test_the_output_of_a_shell_stays_beside_a_run(tmp_path: Path) -> None:
     """`asca train ... > run/train.log`, which the shell opens first."""
     (tmp_path / "train.log").touch()
     require_own_run(tmp_path)
-    claim_run_folder(tmp_path, CONFIG, SEEN)
+    prepare_run_folder(tmp_path, CONFIG, SEEN)
     (tmp_path / "train.log").write_text("Epoch 1\n")
     require_own_run(tmp_path)
     for name in ("config.yaml", "environment.json", "frames.json"):

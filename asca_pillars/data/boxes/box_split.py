@@ -230,7 +230,7 @@ class BoxSplit:
     @cached_property
     def times_s(self) -> dict[str, float]:
         """Time stamps, seconds, of the frames whose labels state one (`time_s`)."""
-        return {one: time_s for one in self.frame_ids if (time_s := self._frames[one].time_s) is not None}
+        return {name: time_s for name in self.frame_ids if (time_s := self._frames[name].time_s) is not None}
 
     def scan_path(self, frame_id: str) -> Path:
         """Return the path of the frame's scan."""

@@ -76,7 +76,7 @@ def _files(frames: Sequence[ScanLabels], line: Callable[[str, NDArray[np.float32
             if kind.split() != [kind]:
                 raise OutputError(f"class {kind!r}: these labels are separated by blanks; choose another format")
         lines = [line(kind, box) for kind, box in zip(frame.records.types, frame.records.boxes, strict=True)]
-        files[f"{frame.name.as_posix()}.txt"] = "".join(f"{one}\n" for one in lines)
+        files[f"{frame.name.as_posix()}.txt"] = "".join(f"{text}\n" for text in lines)
     return files
 
 

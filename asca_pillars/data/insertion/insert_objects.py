@@ -132,9 +132,9 @@ class Rays:
             center = transform_columns(np.array([[x], [y], [z]]), into_box)
             ray[np.abs(ray) < 1e-9] = 1e-9
             half = np.array([[length], [width], [height]]) / 2
-            one, other = (center - half) / ray, (center + half) / ray
-            enters = np.minimum(one, other).max(axis=0)
-            leaves = np.maximum(one, other).min(axis=0)
+            first_side, second_side = (center - half) / ray, (center + half) / ray
+            enters = np.minimum(first_side, second_side).max(axis=0)
+            leaves = np.maximum(first_side, second_side).min(axis=0)
             hits[candidates] |= (enters <= leaves) & (leaves >= 0) & (enters <= 1)
         return hits
 

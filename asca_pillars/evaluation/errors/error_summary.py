@@ -288,7 +288,7 @@ def summarize(
         reporter: for the progress.
     """
     index = {frame_id: number for number, frame_id in enumerate(matches.frame_ids)}
-    indices = {part: np.array(sorted(index[one] for one in ids if one in index)) for part, ids in parts.items()}
+    indices = {part: np.array(sorted(index[frame] for frame in ids if frame in index)) for part, ids in parts.items()}
     indices = {part: numbers for part, numbers in indices.items() if len(numbers)}
     everything = np.arange(len(matches.frame_ids))
     left = np.setdiff1d(everything, np.concatenate([*indices.values(), np.zeros(0, np.int64)]))
@@ -297,7 +297,7 @@ def summarize(
     for title, groups in reporter.track(drawn.items(), "Intervals"):
         chosen = np.unique(np.concatenate(groups).astype(np.int64))
         view = _Part(matches, np.isin(everything, chosen), bootstrap_samples(groups, len(everything)))
-        sets.append(DatasetErrors(title, len(chosen), tuple(view.class_errors(one) for one in matches.scores)))
+        sets.append(DatasetErrors(title, len(chosen), tuple(view.class_errors(frame) for frame in matches.scores)))
     return sets
 
 
@@ -374,7 +374,7 @@ class _Part:
         traits = Counter(trait for _, around in background for trait in around.traits or ("none",))
         frames = np.array([item.frame for item, _ in background], np.int64)
         names = ("distance_m", "points", "top_m", "reflectance", "cluster_length_m")
-        values = np.array([[getattr(around, one) for one in names] for _, around in background], float)
+        values = np.array([[getattr(around, field) for field in names] for _, around in background], float)
         kinds, labels = Counter(item.kind for item in false), Counter(item.label for item in false if item.label)
         counts = self._by_frame(np.array([item.frame for item in false], np.int64))
         return FalseDetections(

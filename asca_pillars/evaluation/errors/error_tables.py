@@ -83,18 +83,18 @@ def error_notes(datasets: Sequence[DatasetErrors]) -> list[str]:
 
 
 def _class_names(datasets: Sequence[DatasetErrors]) -> list[str]:
-    return list(dict.fromkeys(one.class_name for data in datasets for one in data.classes))
+    return list(dict.fromkeys(class_errors.class_name for data in datasets for class_errors in data.classes))
 
 
 def _box_table(datasets: Sequence[DatasetErrors], name: str, *, main: bool) -> TextTable:
     classes = [(data.name, _class_of(data, name)) for data in datasets]
-    groups = dict.fromkeys(group.group for _, one in classes if one is not None for group in one.groups)
+    groups = dict.fromkeys(group.group for _, errors in classes if errors is not None for group in errors.groups)
     rows = [
         (group, title, *_group_cells(group_errors))
         for group in groups
         if (group in MAIN_GROUPS) is main
-        for title, one in classes
-        if (group_errors := _group_of(one, group)) is not None
+        for title, errors in classes
+        if (group_errors := _group_of(errors, group)) is not None
     ]
     titles = (_TITLES.get(column, column.replace("_", " ")) for column in _BOX_COLUMNS)
     columns = ("objects", "dataset", "n", "recall", "below score", "boxes", *titles)
@@ -113,10 +113,16 @@ def _group_cells(group: GroupErrors) -> tuple[str, ...]:
 def _reaching_table(datasets: Sequence[DatasetErrors], names: Sequence[str]) -> TextTable:
     parts = (*CORRECTIONS, WITHOUT_MEDIANS)
     rows = [
-        (name, data.name, str(one.boxes), f"{one.iou_3d:g}", *(f"{one.reaching[part]:.2f}" for part in parts))
+        (
+            name,
+            data.name,
+            str(errors.boxes),
+            f"{errors.iou_3d:g}",
+            *(f"{errors.reaching[part]:.2f}" for part in parts),
+        )
         for name in names
         for data in datasets
-        if (one := _class_of(data, name)) is not None and one.reaching
+        if (errors := _class_of(data, name)) is not None and errors.reaching
     ]
     title = (
         "Share of the boxes on objects that count whose 3D IoU reaches the minimum, as drawn and with parts corrected"
@@ -128,14 +134,14 @@ def _false_table(datasets: Sequence[DatasetErrors], names: Sequence[str]) -> Tex
     rows = []
     for name in names:
         for data in datasets:
-            if (one := _class_of(data, name)) is None:
+            if (class_errors := _class_of(data, name)) is None:
                 continue
-            false = one.false
+            false = class_errors.false
             on = ", ".join(f"{label} {count}" for label, count in false.labels.items()) or _NONE
-            best = _NONE if one.best_score is None else f"{one.best_score:.2f}"
+            best = _NONE if class_errors.best_score is None else f"{class_errors.best_score:.2f}"
             kinds = [str(false.kinds[kind]) for kind in FALSE_KINDS]
             per_frame = _share(false.per_frame, false.per_frame_interval)
-            rows.append((name, data.name, str(data.frames), f"{one.score:.2f}", best, per_frame, *kinds, on))
+            rows.append((name, data.name, str(data.frames), f"{class_errors.score:.2f}", best, per_frame, *kinds, on))
     columns = ("class", "dataset", "frames", "score", "best F1 at", "false per frame", *FALSE_KINDS, "on labels of")
     return TextTable("False detections from the score on", columns, tuple(rows))
 
@@ -144,8 +150,8 @@ def _false_rate_table(datasets: Sequence[DatasetErrors], names: Sequence[str]) -
     rows = []
     for name in names:
         for data in datasets:
-            one = _class_of(data, name)
-            rates = {} if one is None else {rate.per_frame: rate for rate in one.false_rates}
+            class_errors = _class_of(data, name)
+            rates = {} if class_errors is None else {rate.per_frame: rate for rate in class_errors.false_rates}
             if rates:
                 cells = [
                     f"{rate.score:.2f} ({rate.recall:.2f})" if (rate := rates.get(each)) else _NONE
@@ -161,15 +167,15 @@ def _background_table(datasets: Sequence[DatasetErrors], names: Sequence[str]) -
     surroundings = ("distance_m", "points", "top_m", "reflectance", "cluster_length_m")
     for name in names:
         for data in datasets:
-            one = _class_of(data, name)
-            if one is None or not one.false.traits:
+            class_errors = _class_of(data, name)
+            if class_errors is None or not class_errors.false.traits:
                 continue
-            spreads = [one.false.surroundings[key] for key in surroundings]
+            spreads = [class_errors.false.surroundings[key] for key in surroundings]
             cells = [
                 _range(spread, 0 if key == "points" else 2) for key, spread in zip(surroundings, spreads, strict=True)
             ]
-            traits = [f"{one.false.traits[trait]:.2f}" for trait in (*TRAITS, "none")]
-            rows.append((name, data.name, str(one.false.kinds["background"]), *cells, *traits))
+            traits = [f"{class_errors.false.traits[trait]:.2f}" for trait in (*TRAITS, "none")]
+            rows.append((name, data.name, str(class_errors.false.kinds["background"]), *cells, *traits))
     titles = (_TITLES.get(key, key) for key in surroundings)
     title = "What stands where `background` is detected: median (10th to 90th percentile), and share with each trait"
     return TextTable(title, ("class", "dataset", "n", *titles, *TRAITS, "none"), tuple(rows))
@@ -180,7 +186,7 @@ def _fit_table(datasets: Sequence[DatasetErrors], names: Sequence[str]) -> TextT
     for name in names:
         classes = [_class_of(data, name) for data in datasets]
         for statistic in STATISTICS:
-            spreads = [None if one is None else one.label_fit[statistic] for one in classes]
+            spreads = [None if class_errors is None else class_errors.label_fit[statistic] for class_errors in classes]
             if any(spread is not None and spread.count for spread in spreads):
                 rows.append((name, statistic, *map(_fit_cell, spreads)))
     title = (
@@ -199,11 +205,11 @@ def _fit_cell(spread: Spread | None) -> str:
 
 
 def _class_of(data: DatasetErrors, name: str) -> ClassErrors | None:
-    return next((one for one in data.classes if one.class_name == name), None)
+    return next((class_errors for class_errors in data.classes if class_errors.class_name == name), None)
 
 
-def _group_of(one: ClassErrors | None, group: str) -> GroupErrors | None:
-    return None if one is None else next((item for item in one.groups if item.group == group), None)
+def _group_of(class_errors: ClassErrors | None, group: str) -> GroupErrors | None:
+    return None if class_errors is None else next((item for item in class_errors.groups if item.group == group), None)
 
 
 def _spread(spread: Spread, digits: int) -> str:

@@ -87,10 +87,10 @@ def crop_svg(points: NDArray[np.float32], ground: Ground | None, boxes: Sequence
     along, across = offset @ axis, offset @ _right_of(axis)
     depth, right = offset @ sight, offset @ _right_of(sight)
     inside = (np.abs(along) < half[0] + 0.3) & (np.abs(across) < half[1] + 0.3)
-    corners = [footprints(one.box[None])[0] - middle[:2] for one in boxes]
+    corners = [footprints(outline.box[None])[0] - middle[:2] for outline in boxes]
     upwards = np.stack([_right_of(sight), sight], axis=1)
-    outlines = [(_style(one), place @ upwards) for one, place in zip(boxes, corners, strict=True)]
-    outlines += [(_style(one), _arrow(one, middle) @ upwards) for one in boxes]
+    outlines = [(_style(outline), place @ upwards) for outline, place in zip(boxes, corners, strict=True)]
+    outlines += [(_style(outline), _arrow(outline, middle) @ upwards) for outline in boxes]
     panes = [
         _Pane(
             np.stack([right, depth], axis=1)[standing],
@@ -107,9 +107,9 @@ def crop_svg(points: NDArray[np.float32], ground: Ground | None, boxes: Sequence
         (_right_of(sight), right, np.abs(depth) < half_depth),
     ):
         outlines = [
-            (_style(one), _upright(place @ direction, one.box, floor))
-            for one, place in zip(boxes, corners, strict=True)
-            if one.main
+            (_style(outline), _upright(place @ direction, outline.box, floor))
+            for outline, place in zip(boxes, corners, strict=True)
+            if outline.main
         ]
         heights = np.stack([horizontal, height], axis=1)
         panes.append(_Pane(heights, (-reach, _LOW_M), (reach, _HIGH_M), strong & standing, bright, outlines))
@@ -120,15 +120,15 @@ def _right_of(direction: _Doubles) -> _Doubles:
     return np.array([direction[1], -direction[0]])
 
 
-def _style(one: DrawnBox) -> str:
-    return f"{one.kind}{'' if one.main else ' other'}"
+def _style(outline: DrawnBox) -> str:
+    return f"{outline.kind}{'' if outline.main else ' other'}"
 
 
-def _arrow(one: DrawnBox, middle: _Doubles) -> _Doubles:
+def _arrow(outline: DrawnBox, middle: _Doubles) -> _Doubles:
     """Return the (2, 2) line from the box's center to slightly beyond its front."""
-    heading = np.array([np.cos(one.box[6]), np.sin(one.box[6])])
-    start = one.box[:2] - middle[:2]
-    return np.stack([start, start + heading * (one.box[3] / 2 + 0.25)])
+    heading = np.array([np.cos(outline.box[6]), np.sin(outline.box[6])])
+    start = outline.box[:2] - middle[:2]
+    return np.stack([start, start + heading * (outline.box[3] / 2 + 0.25)])
 
 
 def _upright(horizontal: _Doubles, box: _Doubles, floor: float) -> _Doubles:

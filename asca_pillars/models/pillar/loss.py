@@ -62,7 +62,7 @@ def detection_loss(maps: HeadMaps[Tensor], targets: TargetBatch, config: LossCon
         classification = focal_loss(logits, states, config.focal_alpha, config.focal_gamma)
     else:
         quality = logits.new_zeros(len(logits), 1)
-        quality[targets.positives, 0] = overlaps_found(residuals, targets)
+        quality[targets.positives, 0] = predicted_ious(residuals, targets)
         classification = quality_focal_loss(logits, states, quality, config.focal_alpha, config.focal_gamma)
     directions = _by_anchor(maps.directions, values=2)[targets.positives].float()
     box = box_loss(residuals, targets.residuals, config.smooth_l1_beta)
@@ -141,7 +141,7 @@ def quality_focal_loss(logits: Tensor, state: Tensor, quality: Tensor, alpha: fl
     return (weight * (target - torch.sigmoid(logits)).abs() ** gamma * cross_entropy).sum()
 
 
-def overlaps_found(residuals: Tensor, targets: TargetBatch) -> Tensor:
+def predicted_ious(residuals: Tensor, targets: TargetBatch) -> Tensor:
     """Return the 3D IoU of positive anchors' predicted boxes with their targets: (n, 7) -> (n,), without gradient."""
     anchors, directions = targets.anchors.cpu().numpy(), targets.directions.cpu().numpy()
     with np.errstate(over="ignore", invalid="ignore"):  # an overflowing box overlaps nothing

@@ -145,5 +145,5 @@ class Distillation:
 
 def _anchors(spec: PillarSpec) -> PillarSpec:
     """Return the spec without what neither input nor anchors depend on."""
-    classes = tuple(replace(one, positive_iou=1.0, negative_iou=0.0, score_threshold=0.0) for one in spec.classes)
+    classes = tuple(replace(kind, positive_iou=1.0, negative_iou=0.0, score_threshold=0.0) for kind in spec.classes)
     return replace(spec, post=PostProcess(), classes=classes)

@@ -100,7 +100,7 @@ class McapRecording(Recording):
     def messages(self, topic: str) -> Iterator[Message]:
         """Yield the messages of a topic by time; without an index by chunk, and by time within each."""
         self.damage, self._trouble, self._unread, count = None, None, 0, 0
-        declared = sum(one.messages for one in self.topics if one.name == topic)
+        declared = sum(listed.messages for listed in self.topics if listed.name == topic)
         with self._file.open("rb") as stream:
             try:
                 for stored in self._indexed(stream, topic) if self._chunks else self._scanned(stream, topic):

@@ -45,7 +45,7 @@ class PacketCapture(Recording):
         require("packets")
         self.path, self._file = path, file or path
         is_velodyne = self._has_velodyne_packets()
-        self._metadata = None if is_velodyne else _metadata_beside(path)
+        self._metadata = None if is_velodyne else _find_metadata(path)
         self._type = VELODYNE if is_velodyne else OUSTER
         self.topics = [Topic(_TOPIC, self._type, sum(1 for _ in self.messages(_TOPIC)))]
 
@@ -138,7 +138,9 @@ class OusterPackets:
         self._recording, self._topic = recording, topic.name
         name = f"{topic.name.rpartition('/')[0]}/metadata"
         place = f"{recording.path}, {name}"
-        message = next(iter(recording.messages(name)), None) if name in {one.name for one in recording.topics} else None
+        message = (
+            next(iter(recording.messages(name)), None) if name in {listed.name for listed in recording.topics} else None
+        )
         if message is None:
             raise ScanError(f"{place}: no metadata of the Ouster, which {topic.name} needs; record that topic, too")
         try:
@@ -183,25 +185,25 @@ def velodyne_scan(message: Message) -> tuple[Any, StoredPoints]:
 
     scan = decode_message(message, "velodyne_msgs/msg/VelodyneScan")
     packets = velodyne_decoder.PacketVector()
-    for one in scan.packets:
-        stamp_s = one.stamp.sec + one.stamp.nanosec / 1e9
-        packets.append(velodyne_decoder.VelodynePacket(stamp_s, bytes(one.data)))
+    for packet in scan.packets:
+        stamp_s = packet.stamp.sec + packet.stamp.nanosec / 1e9
+        packets.append(velodyne_decoder.VelodynePacket(stamp_s, bytes(packet.data)))
     if not packets:
         return scan.header, StoredPoints(np.zeros((0, 3), np.float32), np.zeros(0, np.float32), np.dtype("<f4"))
     _, points = _of_velodyne(velodyne_decoder.ScanDecoder(velodyne_decoder.Config()).decode(packets))
     return scan.header, StoredPoints(points[:, :3], points[:, 3], np.dtype("<f4"))
 
 
-def _metadata_beside(path: Path) -> Path:
+def _find_metadata(path: Path) -> Path:
     """Return the `.json` with the longest name that equals or begins the capture's name."""
     name = path.name.partition(".pcap")[0]
-    candidates = [one for one in visible_files(path.parent, "*.json") if name.startswith(one.stem)]
+    candidates = [file for file in visible_files(path.parent, "*.json") if name.startswith(file.stem)]
     if not candidates:
         raise ScanError(
             f"{path}: holds no packets of a Velodyne, and for those of an Ouster the sensor's metadata must lie "
             f"beside it as {name}.json"
         )
-    return max(candidates, key=lambda one: len(one.stem))
+    return max(candidates, key=lambda file: len(file.stem))
 
 
 def _packed(time_ns: int, points: NDArray[np.float32]) -> Message:

@@ -36,7 +36,7 @@ def point_cloud(message: Message) -> tuple[Any, StoredPoints]:
     """
     cloud = decode_message(message, "sensor_msgs/msg/PointCloud")
     xyz = np.array([(point.x, point.y, point.z) for point in cloud.points], np.float32).reshape(-1, 3)
-    channel = next((one for name in _REFLECTANCE for one in cloud.channels if one.name.lower() == name), None)
+    channel = next((item for name in _REFLECTANCE for item in cloud.channels if item.name.lower() == name), None)
     if channel is None:
         return cloud.header, StoredPoints(xyz, None, None)
     if len(channel.values) != len(xyz):
@@ -94,9 +94,9 @@ def foxglove_cloud(message: Message) -> Any:
     stride, data = int(content["point_stride"]), content["data"]
     fields = [
         SimpleNamespace(
-            name=one["name"], offset=int(one.get("offset", 0)), datatype=_NUMERIC[int(one["type"])], count=1
+            name=field["name"], offset=int(field.get("offset", 0)), datatype=_NUMERIC[int(field["type"])], count=1
         )
-        for one in content["fields"]
+        for field in content["fields"]
     ]
     count = len(data) // stride if stride else 0
     sec, nanosec = content["time"]

@@ -62,7 +62,7 @@ class SqliteRecording(Recording):
     def messages(self, topic: str) -> Iterator[Message]:
         """Yield the messages of a topic by time; a row without intact data is a message without data."""
         self.damage, count = None, 0
-        declared = sum(one.messages for one in self.topics if one.name == topic)
+        declared = sum(listed.messages for listed in self.topics if listed.name == topic)
         numbers = self._numbers[topic]
         if formats := self._formats[topic] - {"cdr"}:
             raise ScanError(f"{self.path}: {topic} is encoded as {', '.join(sorted(formats))[:40]}; cdr is read")
@@ -152,8 +152,8 @@ def read_metadata(folder: Path) -> BagMetadata | None:
         content = parse_yaml(text)[_KEY]
         names = tuple(Path(str(name)).name for name in content.get("relative_file_paths") or ())
         counts = {
-            str(one["topic_metadata"]["name"]): int(one["message_count"])
-            for one in content.get("topics_with_message_count") or ()
+            str(entry["topic_metadata"]["name"]): int(entry["message_count"])
+            for entry in content.get("topics_with_message_count") or ()
         }
     except (yaml.YAMLError, ValueError, TypeError, KeyError, AttributeError, RecursionError):
         return BagMetadata()
@@ -182,7 +182,7 @@ class SplitRecording(Recording):
         """Yield the messages of a topic, file by file; damage in one does not end the recording."""
         self.damage, count = self._trouble, 0
         for file in self._files:
-            if all(one.name != topic for one in file.topics):
+            if all(listed.name != topic for listed in file.topics):
                 continue
             for message in file.messages(topic):
                 count += 1
@@ -215,7 +215,7 @@ class RosBag(Recording):
         self.damage, count, trouble = None, 0, ""
         damaged_chunks: set[int] = set()
         with self._opened() as reader:
-            connections = {one.id: one for one in reader.connections if one.topic == topic}
+            connections = {connection.id: connection for connection in reader.connections if connection.topic == topic}
             entries = [zip(reader.indexes[number], repeat(number)) for number in connections]
             for entry, number in heapq.merge(*entries, key=lambda pair: pair[0].time):
                 if entry.chunk_pos in damaged_chunks:
@@ -232,7 +232,7 @@ class RosBag(Recording):
                     continue
                 count += 1
                 yield Message(time_ns, bytes(data), "ros1")
-        declared = sum(one.messages for one in self.topics if one.name == topic)
+        declared = sum(connection.messages for connection in self.topics if connection.name == topic)
         if count < declared:
             self.damage = f"{self.path}: {count} of the {declared} messages of {topic} can be read{trouble}"
 

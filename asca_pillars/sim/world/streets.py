@@ -69,7 +69,7 @@ def draw_ground(config: SceneConfig, rng: np.random.Generator, kind: str) -> Gro
         median_half_m=rng.uniform(0.4, 1.5) if median else 0.0,
         rough_m=rng.uniform(*config.grass_m),
         camber=rng.uniform(0.0, 0.035),
-        **_beside(config, rng, kind, half),
+        **_tracks_and_second_carriageway(config, rng, kind, half),
     )
     asphalt = float(np.clip(rng.normal(0.22, 0.03), 0.13, 0.33))
     of_asphalt = np.array([1.0, rng.uniform(0.85, 1.25), 0.0, rng.uniform(1.2, 1.9), 0.0, rng.uniform(0.6, 1.2)])
@@ -89,7 +89,9 @@ def _bank(config: SceneConfig, rng: np.random.Generator, steep: bool) -> float:
     return float(rng.uniform(*config.embankment_slope) if steep else rng.normal(0.0, config.bank_slope_sigma))
 
 
-def _beside(config: SceneConfig, rng: np.random.Generator, kind: str, half: float) -> dict[str, float]:
+def _tracks_and_second_carriageway(
+    config: SceneConfig, rng: np.random.Generator, kind: str, half: float
+) -> dict[str, float]:
     """Draw tracks in the road or on a bed of ballast left of it, and a second carriageway beyond."""
     numbers = {"rails_v_m": NO_RAILS}
     divided = rng.random() < DIVIDED_SHARE.get(kind, 0.0)

@@ -201,7 +201,7 @@ def _detect(task: _Task, reading: ScanSettings, options: RuntimeOptions, reporte
         seconds = process_time() - start
         tracker = Tracker(birth_score=births) if task.track else None
         damages.add(recording.damage)
-        times_ns = [one.time_ns for one in journal.results() if one.detections is not None]
+        times_ns = [result.time_ns for result in journal.results() if result.detections is not None]
         if not times_ns:
             why = run.first() or (f": {recording.damage}" if recording.damage else "")
             raise ScanError(f"{task.path}: none of the {topic.messages} scans of {topic.name} can be read{why}")
@@ -232,7 +232,9 @@ class _Run:
     def __init__(self, detector: Detector, scans: RecordedScans, journal: Journal) -> None:
         self._detector, self._scans, self._journal = detector, scans, journal
         self._coming: deque[RecordedScan] = deque()
-        self.error_texts = [one.error_text for one in journal.results() if one.error_text] if journal.done else []
+        self.error_texts = (
+            [result.error_text for result in journal.results() if result.error_text] if journal.done else []
+        )
         self.kept: list[DetectedScan] = []
 
     def results(self) -> Iterator[None]:
@@ -265,19 +267,19 @@ class _Run:
 
     def _points(self) -> Iterator[NDArray[np.float32]]:
         first = next(number for number in count() if number not in self._journal)
-        for one in self._scans.read(first):
-            if one.number in self._journal:
+        for scan in self._scans.read(first):
+            if scan.number in self._journal:
                 continue
-            self._coming.append(one)
-            if one.scan is not None:
-                yield one.scan.points
+            self._coming.append(scan)
+            if scan.scan is not None:
+                yield scan.scan.points
 
     def _skip(self) -> Iterator[None]:
         """Note the scans before the next one that could be read."""
         while self._coming and self._coming[0].scan is None:
-            one = self._coming.popleft()
-            self.error_texts.append(str(one.error_text))
-            self._journal.add(ScanResult(one.number, one.time_ns, one.frame_id, None, one.error_text))
+            scan = self._coming.popleft()
+            self.error_texts.append(str(scan.error_text))
+            self._journal.add(ScanResult(scan.number, scan.time_ns, scan.frame_id, None, scan.error_text))
             yield
 
 
@@ -339,7 +341,7 @@ def _with_points(
     """Yield each result with the points of its scan, which is read once more; None without `scans`."""
     again = iter(()) if scans is None else scans.read()
     for result in results:
-        points = (one.scan.points for one in again if one.number == result.number and one.scan is not None)
+        points = (other.scan.points for other in again if other.number == result.number and other.scan is not None)
         yield result, None if scans is None else next(points)
 
 

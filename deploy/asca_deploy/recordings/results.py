@@ -217,18 +217,18 @@ def track_results(
         pose_at: from a time, nanoseconds, to the (4, 4) pose of the scan, metres; None: unknown.
     """
     tracked = (
-        FrameResult(one.number, one.time_ns, one.frame_id, one.detections, None, one.dropped_points)
-        for one in journal.results()
-        if one.detections is not None
+        FrameResult(result.number, result.time_ns, result.frame_id, result.detections, None, result.dropped_points)
+        for result in journal.results()
+        if result.detections is not None
     )
     if tracker is None:
         yield from tracked
         return
     results = list(tracked)
-    for index in tracking_order([one.time_ns for one in results]):
-        one = results[index]
-        tracks = _track(tracker, one, None if pose_at is None else pose_at(one.time_ns))
-        results[index] = one._replace(detections=tracks.detections, tracks=tracks)
+    for index in tracking_order([result.time_ns for result in results]):
+        result = results[index]
+        tracks = _track(tracker, result, None if pose_at is None else pose_at(result.time_ns))
+        results[index] = result._replace(detections=tracks.detections, tracks=tracks)
     yield from results
 
 

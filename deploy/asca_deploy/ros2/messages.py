@@ -133,7 +133,7 @@ def filled(message: Any, fields: Mapping[str, Any]) -> Any:
             filled(getattr(message, name), value)
         elif isinstance(value, Sequence) and value and isinstance(value[0], Mapping):
             kind = message_type(kinds[name])
-            setattr(message, name, [filled(kind(), one) for one in value])
+            setattr(message, name, [filled(kind(), item) for item in value])
         else:
             setattr(message, name, bytes([value]) if kinds[name] == "octet" else value)
     return message
@@ -149,7 +149,7 @@ def message_type(kind: str) -> Any:
 
 def _with_tracks(detections: Detections | Tracks) -> list[tuple[Detection, tuple[int, tuple[float, float]] | None]]:
     if isinstance(detections, Tracks):
-        return [(one.detection, (one.track_id, (one.vx_mps, one.vy_mps))) for one in detections]
+        return [(track.detection, (track.track_id, (track.vx_mps, track.vy_mps))) for track in detections]
     return [(box, None) for box in detections]
 
 

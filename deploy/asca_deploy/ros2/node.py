@@ -87,7 +87,7 @@ def reliability(offered: Sequence[str], qos: Qos) -> Literal["best_effort", "rel
         return qos
     if not offered:
         return None
-    return "reliable" if all(one == "reliable" for one in offered) else "best_effort"
+    return "reliable" if all(offer == "reliable" for offer in offered) else "best_effort"
 
 
 def log(event: str, **facts: Any) -> None:
@@ -198,7 +198,7 @@ class _Node:
     def publishers(self) -> list[Callable[[Stamp, ScanDetections | Tracks], None]]:
         """Return the publishers of the boxes of a scan."""
         both = [self._publish(self._markers, marker_array), self._publish(self._detections, detection_array)]
-        return [one for one in both if one is not None]
+        return [publisher for publisher in both if publisher is not None]
 
     def close(self) -> None:
         """Destroy the ROS node."""
@@ -231,8 +231,8 @@ class _Node:
         """Subscribe with the publishers' reliability."""
         qos = self._rclpy.qos
         offered = [
-            "reliable" if one.qos_profile.reliability == qos.ReliabilityPolicy.RELIABLE else "best_effort"
-            for one in self.node.get_publishers_info_by_topic(self.topic)
+            "reliable" if publisher.qos_profile.reliability == qos.ReliabilityPolicy.RELIABLE else "best_effort"
+            for publisher in self.node.get_publishers_info_by_topic(self.topic)
         ]
         requested = reliability(offered, self._settings.qos)
         if requested is None or requested == self._reliability:

@@ -74,8 +74,8 @@ def check_refine_parity(
     for number, scan in enumerate(scans):
         points = scan[np.isfinite(scan).all(axis=1)]
         expected, outputs = stage(points), runtime.infer(runtime.prepare(points, []), []).outputs
-        for name, one, other in zip(HeadMaps._fields, expected.maps, outputs.maps, strict=True):
-            worst = max(worst, require_close(f"head `{name}`", one, other, MAP_TOLERANCE, number))
+        for name, in_torch_part, in_runtime_part in zip(HeadMaps._fields, expected.maps, outputs.maps, strict=True):
+            worst = max(worst, require_close(f"head `{name}`", in_torch_part, in_runtime_part, MAP_TOLERANCE, number))
         allowed = MAP_TOLERANCE * max(1.0, float(np.abs(expected.neck).max(initial=0.0)))
         worst = max(worst, require_close("neck", expected.neck, outputs.neck, allowed, number))
         proposed = second_stage_inputs(outputs, points, model.spec, model.refine.seen)
@@ -87,8 +87,8 @@ def check_refine_parity(
             refinements = refiner(collate_scans([asked]))
         in_torch = refinements.confidence.numpy(), refinements.residuals.numpy()
         in_runtime = runtime.refine(refine_inputs(asked))
-        for name, one, other in zip(("confidence", "residuals"), in_torch, in_runtime, strict=True):
-            worst = max(worst, require_close(f"refine `{name}`", one, other, MAP_TOLERANCE, number))
+        for name, in_torch_part, in_runtime_part in zip(("confidence", "residuals"), in_torch, in_runtime, strict=True):
+            worst = max(worst, require_close(f"refine `{name}`", in_torch_part, in_runtime_part, MAP_TOLERANCE, number))
         scores = model.refine.scores
         difference = require_same_refined(proposed.proposals, in_torch, in_runtime, model.spec, scores, number)
         worst_box, worst_yaw = max(worst_box, difference.center_size_m), max(worst_yaw, difference.yaw_rad)

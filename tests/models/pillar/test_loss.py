@@ -20,7 +20,7 @@ from asca_pillars.models.pillar.loss import (
     box_loss,
     detection_loss,
     focal_loss,
-    overlaps_found,
+    predicted_ious,
     quality_focal_loss,
     states_by_class,
 )
@@ -196,7 +196,7 @@ def test_overlaps_are_those_of_the_decoded_boxes(seed: int) -> None:
     batch = batched([targets])
     noise = torch.randn(batch.residuals.shape, generator=torch.Generator().manual_seed(seed))
     residuals = (batch.residuals + 0.2 * noise).requires_grad_()
-    found = overlaps_found(residuals, batch)
+    found = predicted_ious(residuals, batch)
     assert found.dtype == torch.float32 and not found.requires_grad
     predicted = decode_boxes(residuals.detach().numpy(), targets.directions, targets.anchors)
     expected = iou_3d(predicted, boxes)[np.arange(len(predicted)), targets.matched]
@@ -206,7 +206,7 @@ def test_overlaps_are_those_of_the_decoded_boxes(seed: int) -> None:
 def test_what_overflows_overlaps_nothing() -> None:
     batch = batched([scene_targets(0)[2]])
     for value in (math.nan, math.inf, -math.inf, 1e38):
-        found = overlaps_found(torch.full_like(batch.residuals, value), batch)
+        found = predicted_ious(torch.full_like(batch.residuals, value), batch)
         assert not found.any()
 
 
@@ -224,7 +224,7 @@ def test_the_class_term_is_that_of_the_overlaps(scores: int) -> None:
     states = states_by_class(batch.state, scores)
     rows = maps.scores.permute(0, 2, 3, 1).reshape(-1, scores)
     background = focal_loss(torch.where(states == 1, -1e4, rows), torch.where(states == 1, 0, states), 0.25, 2.0)
-    overlaps = overlaps_found(positive_rows(maps, batch)[0], batch)
+    overlaps = predicted_ious(positive_rows(maps, batch)[0], batch)
     assert 0.05 < overlaps.mean() < 0.95
     own = batch.positives % COUNT // 2 if scores == 3 else torch.zeros_like(batch.positives)
     logits = rows[batch.positives, own][:, None]

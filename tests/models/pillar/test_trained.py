@@ -90,7 +90,7 @@ def test_a_teacher_is_learnt_from_and_in_no_checkpoint(tmp_path: Path, teacher: 
     assert torch.equal(alone["head.scores.weight"], untaught["head.scores.weight"])
 
 
-def test_a_missing_teacher_is_said_before_the_folder_is_claimed(tmp_path: Path) -> None:
+def test_a_missing_teacher_is_said_before_the_folder_is_made(tmp_path: Path) -> None:
     data = write_dataset(tmp_path / "data", 3)
     with pytest.raises(BundleError, match=r"set train\.teacher"):
         train(with_train(teacher="nowhere"), data, tmp_path / "run")
