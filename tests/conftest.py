@@ -43,18 +43,6 @@ def pytest_sessionstart(session: pytest.Session) -> None:
             importlib.import_module(module)
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Begin with the files whose tests take longest: at the end they would keep one process while the other waits."""
-    longest = (
-        "test_telemetry.py",
-        "test_loop.py",
-        "test_loaders.py",
-        "test_documentation.py",
-        "test_own_classes_page.py",
-    )
-    items.sort(key=lambda item: item.path.name not in longest)
-
-
 def pytest_collection_finish() -> None:
     """From here on garbage is collected, of what the tests make."""
     gc.freeze()

@@ -8,7 +8,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -126,6 +126,11 @@ class Fresh:
                     yield path.relative_to(self.home.parent)
 
 
+@pytest.fixture
+def fresh(tmp_path: Path, _filtered: None) -> Fresh:
+    return Fresh(tmp_path / "fresh")
+
+
 COMMANDS = """
 import importlib, json, os, sys, time
 
@@ -163,75 +168,44 @@ def asca(first: str, *commands: tuple[object, ...], wait_s: float = 0) -> tuple[
     return sys.executable, "-c", COMMANDS, first, listed, str(wait_s)
 
 
-@dataclasses.dataclass
-class Running:
-    """A process that was started, and where it may write."""
-
-    fresh: Fresh
-    process: Future[subprocess.CompletedProcess[str]]
-
-
-@pytest.fixture(scope="module")
-def processes(tmp_path_factory: pytest.TempPathFactory, _filtered: None) -> Iterator[dict[str, Running]]:
-    """All started at once, because two of them mostly wait for reports."""
+def test_commands_of_the_runtime(fresh: Fresh, tmp_path: Path) -> None:
+    """Reports would be seen, where a process has imported onnxruntime for long."""
+    commands = ["detect -o out/detect", "bench --rounds 1 --json out/bench.json", "doctor"]
+    if importlib.util.find_spec("openvino") is not None:
+        commands.append(f"detect -o out/openvino -b {DENSE_INT8} --provider openvino")
+    (fresh.work / "out").mkdir()
+    reporting = Fresh(tmp_path / "reporting")
     with ThreadPoolExecutor() as pool:
-
-        def start(name: str, *command: Any, **environment: str) -> Running:
-            fresh = Fresh(root / name)
-            (fresh.work / "out").mkdir()
-            return Running(fresh, pool.submit(fresh.run, *command, **environment))
-
-        root = tmp_path_factory.mktemp("processes")
-        commands = ["detect -o out/detect", "bench --rounds 1 --json out/bench.json", "doctor"]
-        if importlib.util.find_spec("openvino") is not None:
-            commands.append(f"detect -o out/openvino -b {DENSE_INT8} --provider openvino")
-        runtime = asca("asca_deploy", *(tuple(command.split()) for command in commands), wait_s=REPORT_S)
         sleeps = f"import asca_deploy, time; time.sleep({2 * REPORT_S})"
-        yield {
-            "reporting": start("reporting", sys.executable, "-c", sleeps, ORT_DISABLE_TELEMETRY="0"),
-            "runtime": start("runtime", *runtime),
-            "training": start("training", *_train_and_export(root)),
-        }
+        would = pool.submit(reporting.run, sys.executable, "-c", sleeps, ORT_DISABLE_TELEMETRY="0")
+        result = fresh.run(*asca("asca_deploy", *(tuple(command.split()) for command in commands), wait_s=REPORT_S))
+        assert result.returncode == 0, f"{result.stdout}{result.stderr}"
+        assert json.loads((fresh.work / "out/bench.json").read_text())
+        assert [path for path in fresh.files() if not path.as_posix().startswith("work/out/")] == []
+        if not onnxruntime.__version__.startswith("1.32."):
+            pytest.skip("the other half is about what onnxruntime 1.32 does")
+        assert would.result().returncode == -signal.SIGSYS
+    assert any(path.name == "deviceid" for path in reporting.files())
 
 
-def _train_and_export(root: Path) -> tuple[str, ...]:
+def test_training_and_export(fresh: Fresh, tmp_path: Path) -> None:
     from asca_pillars.config.pillar import PillarModel
     from tests.export.tiny import SCANS
     from tests.helpers.scenes import SPEC, write_dataset
     from tests.helpers.tiny_run import CONFIG, NETWORK
 
-    data, scans = write_dataset(root / "data", 3), root / "scans"
+    data, scans = write_dataset(tmp_path / "data", 3), tmp_path / "scans"
     scans.mkdir()
     for number, points in enumerate(SCANS):
         np.save(scans / f"{number}.npy", points)
     model = PillarModel(spec=SPEC, network=dataclasses.replace(NETWORK, cpa="none"))
     config = dataclasses.replace(CONFIG, model=model, train=dataclasses.replace(CONFIG.train, epochs=1))
-    (root / "tiny.yaml").write_text(yaml.safe_dump(to_dict(config)))
-    return asca(
+    (tmp_path / "tiny.yaml").write_text(yaml.safe_dump(to_dict(config)))
+    commands = asca(
         "asca_pillars.training.loop",
-        ("train", root / "tiny.yaml", "--data", data, "--out", "out/run"),
-        ("export", "out/run/checkpoints/last.ckpt", "--scans", scans, "-o", "out/bundle"),
+        ("train", tmp_path / "tiny.yaml", "--data", data, "--out", "run"),
+        ("export", "run/checkpoints/last.ckpt", "--scans", scans, "-o", "bundle"),
     )
-
-
-def assert_wrote_below_out(running: Running) -> None:
-    result = running.process.result()
+    result = fresh.run(*commands)
     assert result.returncode == 0, f"{result.stdout}{result.stderr}"
-    assert [path for path in running.fresh.files() if not path.as_posix().startswith("work/out/")] == []
-
-
-def test_training_and_export(processes: dict[str, Running]) -> None:
-    running = processes["training"]
-    assert_wrote_below_out(running)
-    assert {path.parts[2] for path in running.fresh.files()} == {"run", "bundle"}
-
-
-def test_commands_of_the_runtime(processes: dict[str, Running]) -> None:
-    """Reports would be seen, where a process has imported onnxruntime for long."""
-    assert_wrote_below_out(processes["runtime"])
-    assert json.loads((processes["runtime"].fresh.work / "out/bench.json").read_text())
-    if not onnxruntime.__version__.startswith("1.32."):
-        pytest.skip("the other half is about what onnxruntime 1.32 does")
-    reporting = processes["reporting"]
-    assert reporting.process.result().returncode == -signal.SIGSYS
-    assert any(path.name == "deviceid" for path in reporting.fresh.files())
+    assert {path.parts[:2] for path in fresh.files()} == {("work", "run"), ("work", "bundle")}

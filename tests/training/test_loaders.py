@@ -65,10 +65,10 @@ def test_an_epoch_begins_while_processes_are_at_the_last_one() -> None:
 
 @pytest.mark.parametrize(
     ("what", "message"),
-    [("SIGKILL", "exited unexpectedly"), ("unsendable", "exited unexpectedly"), ("SIGSTOP", "no batch in 2 seconds")],
+    [("SIGKILL", "exited unexpectedly"), ("unsendable", "exited unexpectedly"), ("SIGSTOP", "no batch in 4 seconds")],
 )
 def test_a_process_that_fails_ends_the_run(what: str, message: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(loaders, "MOST_LOOKS", 2)
+    monkeypatch.setattr(loaders, "MOST_LOOKS", 4)
     monkeypatch.setattr(loaders, "LOOK_AGAIN_S", 1)
     start = time.monotonic()
     with pytest.raises(WorkerError, match=f"{message}.*data.workers=0") as caught:
