@@ -93,7 +93,7 @@ def ablate(
     check(rows, config, overrides, data, init)
     require_same_base(out, {"config": to_dict(base), "data": str(data)} | ({} if init is None else {"init": str(init)}))
     waiting = [load_config(config, [*overrides, *run.variant.overrides]) for run in todo if not run.trained.exists()]
-    if any(run.augment.insert.method != "none" for run in waiting):
+    if any(settings.augment.insert.method != "none" for settings in waiting):
         # Checked once, not by every run.
         with Bars(console) as bars:
             prepare(base, data, workers=default_threads(), reporter=Reporter(bars))

@@ -94,7 +94,9 @@ def measure_parts(
         compared = compare({next(iter(bundles)): detector} | others, scans, rounds, bar)
         detections, *other_detections = ([each(points) for points in scans] for each in (detector, *others.values()))
         boxes = {name: box_difference(detections, other) for name, other in zip(others, other_detections, strict=True)}
-        result["compare"] = asdict(compared) | {"boxes": {name: asdict(each) for name, each in boxes.items()}}
+        result["compare"] = asdict(compared) | {
+            "boxes": {name: asdict(difference) for name, difference in boxes.items()}
+        }
         console.print(comparison_table(compared, boxes))
     if parts.matrix:
         ways = measure_matrix(bundles, scans, rounds, bar, mounting=detector.mounting, threads=detector.threads)

@@ -154,8 +154,8 @@ def write_gallery(
             values["errors"] = matches[0].errors
         else:
             values["difference"] = _difference(*matches)
-        for (missed, false), detector in zip(kinds, matches, strict=True):
-            values |= {missed: int(detector.missed.sum()), false: int(detector.false_positive.sum())}
+        for (missed, false), match in zip(kinds, matches, strict=True):
+            values |= {missed: int(match.missed.sum()), false: int(match.false_positive.sum())}
         cards.append(GalleryCard(frame_id, PurePath(name), values))
     page = gallery_page(f"{title}: {words['which']}", _INTRODUCTION.format(**words), cards, None, end=INDEX_END)
     write_text(Path(folder) / INDEX, page)

@@ -104,7 +104,7 @@ def tracking_report(split: BoxSplit, predictions: Path, subject: str, about: dic
     path = predictions / "detections.jsonl" if predictions.is_dir() else predictions
     by_frame = predictions_by_frame(path, split)
     scope = stated_scope(path, by_frame.values())
-    predicted = sorted({kind for records in by_frame.values() for kind in records.records.types})
+    predicted = sorted({kind for line in by_frame.values() for kind in line.records.types})
     names = tuple(dict.fromkeys((*(() if scope is None else scope.classes), *predicted)))
     sequences: dict[str, list[_Frame]] = {}
     labelled: Counter[str] = Counter()

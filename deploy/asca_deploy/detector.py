@@ -269,8 +269,8 @@ class Detector:
             frame.stage_times.append((_WAITING, perf_counter()))
             return frame, [self.pipeline.infer(each, frame.stage_times) for each in prepared]
 
-        def finish(detections: tuple[_Frame, list[Any]]) -> ScanDetections:
-            frame, raw = detections
+        def finish(inferred: tuple[_Frame, list[Any]]) -> ScanDetections:
+            frame, raw = inferred
             frame.stage_times.append((_WAITING, perf_counter()))
             return self._finish(frame, raw)
 

@@ -82,12 +82,12 @@ class ScanDetections(Detections):
         if points is None:
             points = self._points()
         points = np.empty((0, 4), np.float32) if points is None else np.asarray(points)
-        level = replace(self, boxes=self._level_boxes())
+        leveled = replace(self, boxes=self._level_boxes())
         if self.level is not None:
             points = self.level.points(points)
             labels = None if labels is None else self.level.boxes(labels)
         draw = draw_chase if view == "chase" else draw_layers
-        return draw(points, class_layers(level, labels), self.ranges, width_px=width_px).view(Picture)
+        return draw(points, class_layers(leveled, labels), self.ranges, width_px=width_px).view(Picture)
 
     def _points(self) -> NDArray[Any] | None:
         return None if self.source is None else self.source()

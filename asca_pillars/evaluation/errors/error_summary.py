@@ -297,7 +297,7 @@ def summarize(
     for title, groups in reporter.track(drawn.items(), "Intervals"):
         chosen = np.unique(np.concatenate(groups).astype(np.int64))
         view = _Part(matches, np.isin(everything, chosen), bootstrap_samples(groups, len(everything)))
-        sets.append(DatasetErrors(title, len(chosen), tuple(view.class_errors(frame) for frame in matches.scores)))
+        sets.append(DatasetErrors(title, len(chosen), tuple(view.class_errors(name) for name in matches.scores)))
     return sets
 
 

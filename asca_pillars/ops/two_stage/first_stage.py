@@ -110,7 +110,7 @@ def run_first_stage(stage: FirstStage, points: NDArray[np.float32], settings: Fi
 def second_stage_inputs(
     outputs: FirstStageOutputs, points: NDArray[np.float32], spec: DetectorSpec, settings: FirstStageSettings
 ) -> SecondStageInputs:
-    """Return the second stage's input from the first stage's outputs `outputs` for finite points (N, 4) of one scan."""
+    """Return the second stage's input, from the outputs of the first one for finite points (N, 4) of one scan."""
     proposals = propose(outputs.maps, spec, settings.proposals, outputs.cells)
     near = points_near_boxes(points, proposals.boxes, settings.keypoints.margin_m)
     keypoints = np.ascontiguousarray(near[farthest_points(near, settings.keypoints.count), :3])

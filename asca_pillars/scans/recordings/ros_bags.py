@@ -232,7 +232,7 @@ class RosBag(Recording):
                     continue
                 count += 1
                 yield Message(time_ns, bytes(data), "ros1")
-        declared = sum(connection.messages for connection in self.topics if connection.name == topic)
+        declared = sum(listed.messages for listed in self.topics if listed.name == topic)
         if count < declared:
             self.damage = f"{self.path}: {count} of the {declared} messages of {topic} can be read{trouble}"
 

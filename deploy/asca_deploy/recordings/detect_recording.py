@@ -267,19 +267,21 @@ class _Run:
 
     def _points(self) -> Iterator[NDArray[np.float32]]:
         first = next(number for number in count() if number not in self._journal)
-        for scan in self._scans.read(first):
-            if scan.number in self._journal:
+        for recorded in self._scans.read(first):
+            if recorded.number in self._journal:
                 continue
-            self._coming.append(scan)
-            if scan.scan is not None:
-                yield scan.scan.points
+            self._coming.append(recorded)
+            if recorded.scan is not None:
+                yield recorded.scan.points
 
     def _skip(self) -> Iterator[None]:
         """Note the scans before the next one that could be read."""
         while self._coming and self._coming[0].scan is None:
-            scan = self._coming.popleft()
-            self.error_texts.append(str(scan.error_text))
-            self._journal.add(ScanResult(scan.number, scan.time_ns, scan.frame_id, None, scan.error_text))
+            recorded = self._coming.popleft()
+            self.error_texts.append(str(recorded.error_text))
+            self._journal.add(
+                ScanResult(recorded.number, recorded.time_ns, recorded.frame_id, None, recorded.error_text)
+            )
             yield
 
 
