@@ -11,7 +11,7 @@ from asca_deploy.bundle import ENCODER, NECK, PillarBundle
 from asca_deploy.graph import Interface, Session, Tensor, check_interface
 from asca_pillars.base.errors import ProviderError
 from asca_pillars.detection.decode import HeadMaps
-from asca_pillars.ops.pillar.neck_rulebooks import LEVELS, SAME
+from asca_pillars.ops.pillar.neck_rulebooks import LEVELS, SAME, NeckRulebooks
 from asca_pillars.ops.pillar.prepare import FEATURES
 from asca_pillars.ops.two_stage.first_stage import FirstStageOutputs
 
@@ -104,8 +104,14 @@ class PillarBackbone(Protocol):
     def stage(self) -> str:
         """Name of the stage `place` in reports."""
 
-    def place(self, pillar_features: NDArray[Any], cells: NDArray[np.int64]) -> Any:
-        """Place pillar features (P, C), in the bundle's type, at flat cell indices (P,): the graph's input."""
+    def build_rulebooks(self, cells: NDArray[np.int64]) -> NeckRulebooks[NDArray[np.int32]] | None:
+        """Build what the graph takes of the flat cell indices (P,) alone, beside the encoder; None if it is nothing."""
+
+    def place(self, pillar_features: NDArray[Any], cells: NDArray[np.int64], rulebooks: Any = None) -> Any:
+        """Place pillar features (P, C), in the bundle's type, at flat cell indices (P,): the graph's input.
+
+        `rulebooks` are those that `build_rulebooks` has returned for the cells; they are built here without.
+        """
 
     def run(self, placed: Any) -> HeadOutputs:
         """Run the graph; each placed scan may be given once."""

@@ -1,6 +1,7 @@
 """The pillar family's pipeline: pillarize, encode, scatter or rulebooks, neck and head, decode (paper section 3)."""
 
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from time import perf_counter
 from typing import Any, NamedTuple, TypeVar
@@ -25,7 +26,7 @@ from asca_deploy.pipeline import Pipeline, StageTimes
 from asca_pillars.base.kernels import load_kernels
 from asca_pillars.detection.decode import HeadMaps, decode
 from asca_pillars.detection.detections import Detections
-from asca_pillars.ops.pillar.grid import PillarGrid, pool_pillars
+from asca_pillars.ops.pillar.grid import PillarGrid, map_cells, pool_pillars
 from asca_pillars.ops.pillar.neck_rulebooks import NeckRulebookBuilder, NeckRulebooks, rulebook_inputs
 from asca_pillars.ops.pillar.prepare import KERNELS, PillarCounts, Pillars, pillarize
 from asca_pillars.ops.pillar.spec import PillarSpec
@@ -72,14 +73,17 @@ class PillarPipeline:
         self.backbone = open_backbone(path, bundle, provider, precision, threads, neck)
         self.stages = ("pillarize", "encode", self.backbone.stage, "neck+head", "decode")
         self._anchors = self.spec.anchors
+        self._executor = ThreadPoolExecutor(1) if threads > 1 and bundle.pillar.neck == "sparse" else None
 
     def prepare(self, points: NDArray[np.float32], stage_times: StageTimes) -> PreparedPillars:
         """Prepare the backbone's input from points (N, 4), metres, LiDAR frame, and reflectance."""
         pillars = self.pillarize(points)
         stage_times.append(("pillarize", perf_counter()))
+        # The encoder has one thread, see `open_encoder`.
+        building = self._executor and self._executor.submit(self.backbone.build_rulebooks, pillars.cells)
         features = self.encode(pillars)
         stage_times.append(("encode", perf_counter()))
-        placed = self.backbone.place(features, pillars.cells)
+        placed = self.backbone.place(features, pillars.cells, building and building.result())
         stage_times.append((self.backbone.stage, perf_counter()))
         return PreparedPillars(placed, pillars.stats)
 
@@ -184,15 +188,16 @@ class DenseBackbone:
     stage = "scatter"
 
     def __init__(self, session: Session, bundle: PillarBundle) -> None:
-        self._session, self._bundle, self._pools = session, bundle, bundle.spec.grid.pools
+        self._session, self._bundle = session, bundle
         self._free = [self.new_canvas()]
 
-    def place(self, pillar_features: NDArray[Any], cells: NDArray[np.int64]) -> Canvas:
+    def build_rulebooks(self, cells: NDArray[np.int64]) -> None:
+        """Return None: a dense neck has no rulebooks."""
+
+    def place(self, pillar_features: NDArray[Any], cells: NDArray[np.int64], rulebooks: None = None) -> Canvas:
         """Place pillar features (P, C) at their cells, flat indices (P,), on a canvas that `run` gives back."""
         canvas = take_or_create(self._free, self.new_canvas)
-        if self._pools:
-            pillar_features, cells = pool_pillars(pillar_features, cells, self._bundle.spec.grid)
-        canvas.scatter(pillar_features, cells)
+        canvas.scatter(*pool_pillars(pillar_features, cells, self._bundle.spec.grid))
         return canvas
 
     def run(self, placed: Canvas) -> HeadOutputs:
@@ -239,18 +244,27 @@ class SparseBackbone:
     stage = "tables"
 
     def __init__(self, session: Session, bundle: PillarBundle, neck_channels: int = 0) -> None:
-        self._session, self._bundle, self._pools = session, bundle, bundle.spec.grid.pools
+        self._session, self._bundle = session, bundle
         self._channels = output_channels(bundle, neck_channels)
         self._free = [self._new_builder()]
 
-    def place(self, pillar_features: NDArray[Any], cells: NDArray[np.int64]) -> SparseBackboneInputs:
-        """Return pillar features (P, C) with the rulebooks of their cells, flat indices (P,)."""
+    def build_rulebooks(self, cells: NDArray[np.int64]) -> NeckRulebooks[NDArray[np.int32]]:
+        """Build the rulebooks of the cells, flat indices (P,)."""
+        mapped = map_cells(cells, self._bundle.spec.grid)
         builder = take_or_create(self._free, self._new_builder)
-        if self._pools:
-            pillar_features, cells = pool_pillars(pillar_features, cells, self._bundle.spec.grid)
-        rulebooks = builder.build(cells)
+        rulebooks = builder.build(cells if mapped is None else mapped.cells)
         self._free.append(builder)
-        return SparseBackboneInputs(pillar_features, rulebooks)
+        return rulebooks
+
+    def place(
+        self,
+        pillar_features: NDArray[Any],
+        cells: NDArray[np.int64],
+        rulebooks: NeckRulebooks[NDArray[np.int32]] | None = None,
+    ) -> SparseBackboneInputs:
+        """Return pillar features (P, C) with the rulebooks of their cells, flat indices (P,)."""
+        pooled, _ = pool_pillars(pillar_features, cells, self._bundle.spec.grid)
+        return SparseBackboneInputs(pooled, rulebooks or self.build_rulebooks(cells))
 
     def run(self, placed: SparseBackboneInputs) -> HeadOutputs:
         """Run the graph: scores (M, A), boxes (M, 7A), directions (M, 2A) at M active head cells."""
