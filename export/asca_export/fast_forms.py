@@ -72,6 +72,17 @@ def fast_encoder(encode: PillarEncoder) -> nn.Module:
     return encode if encode.point_attention is not None or encode.slots else FastEncoder(encode)
 
 
+@torch.library.custom_op("asca::product_max", mutates_args=())
+def product_max(features: Tensor, weight: Tensor, pillar_index: Tensor, point_counts: Tensor) -> Tensor:
+    """Return the maximum of `features @ weight` over the points of each pillar: (M, 9) -> (P, C), see `pillar_max`."""
+    return pillar_max(features @ weight, pillar_index, point_counts)
+
+
+@product_max.register_fake
+def _(features: Tensor, weight: Tensor, pillar_index: Tensor, point_counts: Tensor) -> Tensor:
+    return features.new_empty(point_counts.shape[0], weight.shape[1])
+
+
 class FastEncoder(nn.Module):
     """Linear, max over the points of a pillar, bias, ReLU, attention; see `PillarEncoder`, which stays as it is."""
 
@@ -83,7 +94,7 @@ class FastEncoder(nn.Module):
 
     def forward(self, features: Tensor, pillar_index: Tensor, point_counts: Tensor) -> Tensor:
         """Point features (M, 9) and their pillars -> pillar features (P, C)."""
-        largest = pillar_max(features @ self.weight, pillar_index, point_counts)
+        largest = product_max(features, self.weight, pillar_index, point_counts)
         pillars: Tensor = self.pillar_attention(torch.relu(largest + self.bias))
         return pillars
 

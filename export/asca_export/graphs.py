@@ -29,6 +29,9 @@ B = TypeVar("B", bound=Bundle)
 OPSET = 20
 _EXAMPLE_ROWS = 6  # rows of the traced example; dynamic in the graph
 LOWEST = -3.0e38  # below any feature; every pillar holds a point, so it never survives the max
+PIECES = 4
+"""Parts of a scan's points whose features are computed and reduced one after the other, so that they stay in the
+cache."""
 
 
 def export_encoder(encode: nn.Module, path: Path) -> None:
@@ -145,7 +148,10 @@ def export_graph(module: nn.Module, example: Sequence[Tensor], path: Path, **nam
             tuple(example),
             dynamo=True,
             opset_version=OPSET,
-            custom_translation_table={torch.ops.asca.pillar_max.default: _scatter_max},
+            custom_translation_table={
+                torch.ops.asca.pillar_max.default: _scatter_max,
+                torch.ops.asca.product_max.default: _product_max,
+            },
             verbose=False,
             **names,
         )
@@ -185,6 +191,24 @@ def _scatter_max(features: Any, pillar_index: Any, point_counts: Any) -> Any:
     shape = op.Concat(op.Shape(point_counts), op.Shape(features, start=1), axis=0)
     lowest = op.Expand(op.Constant(value_float=LOWEST), shape)
     return op.ScatterND(lowest, op.Unsqueeze(pillar_index, op.Constant(value_ints=[1])), features, reduction="max")
+
+
+def _product_max(features: Any, weight: Any, pillar_index: Any, point_counts: Any) -> Any:
+    """Translate `fast_forms.product_max` to ONNX: PIECES of about as many points, cut between two pillars."""
+    points, pillar, row, pieces = op.Shape(pillar_index), _integers(0), _integers(0), []
+    for piece in range(1, PIECES + 1):
+        place = op.Div(op.Mul(points, _integers(piece)), _integers(PIECES))
+        last = op.Shape(point_counts) if piece == PIECES else op.Gather(pillar_index, place)
+        counts = op.Slice(point_counts, pillar, last)
+        end = op.Add(row, op.ReduceSum(counts, _integers(0)))
+        index = op.Sub(op.Slice(pillar_index, row, end), pillar)
+        pieces.append(_scatter_max(op.MatMul(op.Slice(features, row, end), weight), index, counts))
+        pillar, row = last, end
+    return op.Concat(*pieces, axis=0)
+
+
+def _integers(*values: int) -> Any:
+    return op.Constant(value_ints=values)
 
 
 def _forget_origin(graph: Any) -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import onnx
+import onnxruntime
 import pytest
 import torch
 from torch import Tensor, nn
@@ -63,6 +64,29 @@ def test_the_maximum_before_bias_and_relu(cpa: CpaReading, tmp_path: Path) -> No
     graphs.export_encoder(fast, tmp_path / "encoder.onnx")
     operators = [node.op_type for node in onnx.load(tmp_path / "encoder.onnx").graph.node]
     assert operators.index("MatMul") < operators.index("ScatterND") < operators.index("Relu")
+
+
+@pytest.mark.parametrize("counts", [[1], [5], [1, 1], [1, 9], [9, 1], [1, 4, 2, 32, 1], [1] * 50, [64, 64, 64]])
+@torch.no_grad()
+def test_pieces_of_few_points_give_the_same_maximum(counts: list[int], encoder_graph: Path) -> None:
+    """Some of the PIECES that the graph reduces one after the other are empty then."""
+    fast = fast_encoder(tiny_detector("channel").encode)
+    sizes = torch.tensor(counts)
+    given = {
+        "features": torch.randn(sum(counts), 9, generator=torch.Generator().manual_seed(0)) * 3,
+        "pillar_index": torch.arange(len(counts)).repeat_interleave(sizes),
+        "point_counts": sizes,
+    }
+    session = onnxruntime.InferenceSession(encoder_graph)
+    (actual,) = session.run(None, {name: value.numpy() for name, value in given.items()})
+    torch.testing.assert_close(torch.from_numpy(actual), fast(*given.values()), atol=1e-5, rtol=1e-5)
+
+
+@pytest.fixture(scope="module")
+def encoder_graph(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("pieces") / "encoder.onnx"
+    graphs.export_encoder(fast_encoder(tiny_detector("channel").encode), path)
+    return path
 
 
 def test_an_encoder_that_needs_every_point_stays_as_it_is() -> None:
