@@ -92,7 +92,7 @@ def measure_parts(
     if parts.compare:
         others = {name: _open_like(detector, folder) for name, folder in list(bundles.items())[1:]}
         compared = compare({next(iter(bundles)): detector} | others, scans, rounds, bar)
-        detections, *other_detections = ([each(points) for points in scans] for each in (detector, *others.values()))
+        detections, *other_detections = ([model(points) for points in scans] for model in (detector, *others.values()))
         boxes = {name: box_difference(detections, other) for name, other in zip(others, other_detections, strict=True)}
         result["compare"] = asdict(compared) | {
             "boxes": {name: asdict(difference) for name, difference in boxes.items()}

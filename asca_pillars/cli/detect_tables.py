@@ -60,7 +60,10 @@ def scans(results: DetectedScans, spec: DetectorSpec) -> Table:
 
 def timing(reports: Sequence[FrameReport], detector: Detector) -> str:
     """Return the median times of frames after the warm-up, by stage."""
-    medians = {stage: statistics.median(each.times_ms[stage] for each in reports) for stage in reports[0].times_ms}
+    medians = {
+        stage: statistics.median(scan_report.times_ms[stage] for scan_report in reports)
+        for stage in reports[0].times_ms
+    }
     total_ms = statistics.median(report.total_ms for report in reports)
     stages = " + ".join(f"{stage} {value:.1f}" for stage, value in medians.items())
     passes = f" in {detector.passes} passes" if detector.passes > 1 else ""

@@ -108,7 +108,7 @@ class PvRcnnModel(Strict):
         if len(self.network.source_widths) != len(self.settings.sources):
             raise ConfigError(
                 f"model.network.source_widths has {len(self.network.source_widths)} entries: give one for each of "
-                f"model.settings.sources {', '.join(each.source for each in self.settings.sources)}"
+                f"model.settings.sources {', '.join(sa.source for sa in self.settings.sources)}"
             )
         scales, widths = self.settings.scale_radii_m, self.network.scale_widths
         if scales and len(widths) != len(scales):
@@ -116,7 +116,7 @@ class PvRcnnModel(Strict):
                 f"model.network.scale_widths has {len(widths)} entries: give one for each of the {len(scales)} radii "
                 "of model.settings.scale_radii_m"
             )
-        if self.network.gate != "none" and "points" not in {each.source for each in self.settings.sources}:
+        if self.network.gate != "none" and "points" not in {sa.source for sa in self.settings.sources}:
             raise ConfigError(
                 f"model.network.gate = {self.network.gate}: gates raw points; add `points` to model.settings.sources"
             )

@@ -142,7 +142,7 @@ def decode_candidates(
     if per_anchor > 1:
         every = scores.reshape(-1, count, per_anchor)
         scores, labels = every.max(axis=2), every.argmax(axis=2)  # one that is not a number stays so
-    least = [each.score_threshold for each in classes]
+    least = [class_spec.score_threshold for class_spec in classes]
     if post.vote_iou is not None:
         least = [min(score, VOTE_SCORE) for score in least]
     anchor, row = _candidates(scores, labels, least, post.candidates)

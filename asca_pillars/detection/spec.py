@@ -93,7 +93,7 @@ class DetectorSpec(Strict, ABC):
         Raises:
             ConfigError: the other one has a class that this one lacks.
         """
-        scores = {each.name: each.score_threshold for each in other.classes}
+        scores = {class_spec.name: class_spec.score_threshold for class_spec in other.classes}
         return replace(self.with_score_threshold(scores), post=other.post)
 
     def decode(self, maps: HeadMaps[NDArray[np.float32]], cells: NDArray[np.integer[Any]] | None = None) -> Detections:

@@ -161,7 +161,7 @@ def require_same_arrays(
         TrainingError: they differ; names the first array that does.
     """
     for name in {**expected, **loaded}:
-        has, needs = (tuple(each[name].shape) if name in each else "missing" for each in (loaded, expected))
+        has, needs = (tuple(arrays[name].shape) if name in arrays else "missing" for arrays in (loaded, expected))
         if has != needs:
             raise TrainingError(
                 f"{path}: weights of another network: {name} is {has} there and {needs} in {expected_in}; {remedy}"

@@ -58,7 +58,7 @@ def rulebook_conv(features: Tensor, weight: Tensor, table: Tensor, back: Tensor 
     """
     device = features.device.type
     if torch.is_autocast_enabled(device):
-        features, weight = (each.to(torch.get_autocast_dtype(device)) for each in (features, weight))
+        features, weight = (tensor.to(torch.get_autocast_dtype(device)) for tensor in (features, weight))
     result: Tensor = _RulebookConv.apply(features, weight, table, table.flip(1) if back is None else back)
     return result
 

@@ -205,21 +205,21 @@ def _draw_trail(canvas: Image, camera: ChaseCamera, trail: Trail) -> None:
 
 def _draw_boxes(texts: Texts, camera: ChaseCamera, layers: Sequence[BoxLayer]) -> None:
     """Draw boxes, far ones first, then texts, those of near boxes before others."""
-    each = [
+    drawn = [
         (box, layer, layer.texts[row] if layer.texts else "")
         for layer in layers
         for row, box in enumerate(np.asarray(layer.boxes, np.float64).reshape(-1, 7))
     ]
-    if not each:
+    if not drawn:
         return
-    boxes = np.stack([box for box, _, _ in each])
+    boxes = np.stack([box for box, _, _ in drawn])
     _, depths = camera.project(boxes[:, :3])
     order = np.argsort(-depths, kind="stable")
     for number in order:
-        _, layer, _ = each[number]
+        _, layer, _ = drawn[number]
         _draw_box(texts.canvas, camera, boxes[number], layer, float(depths[number]))
     for number in order[::-1]:
-        box, layer, text = each[number]
+        box, layer, text = drawn[number]
         above_m = box[2] + box[5] / 2 + 0.25
         (column, row), depth = camera.project(np.array([box[0], box[1], above_m]))
         if depth > _NEAR_M and 0 < column < camera.width_px and 0 < row < camera.height_px:

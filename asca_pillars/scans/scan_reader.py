@@ -161,9 +161,9 @@ def read_raw_floats(path: Path, columns: int | None = None) -> StoredPoints:
         columns = _columns(path, size, data)
         remarks = (f"read as {columns} columns ({_FIVE}), which the values fit",) if columns == 5 else ()
     if size % (4 * columns):
-        each = f"{4 * columns} bytes per point (float32 {_FOUR if columns == 4 else f'in {columns} columns'})"
+        point_size = f"{4 * columns} bytes per point (float32 {_FOUR if columns == 4 else f'in {columns} columns'})"
         raise ScanError(
-            f"{path}: file size ({size} byte{'s'[: size != 1]}) is not a multiple of {each}; state other columns "
+            f"{path}: file size ({size} byte{'s'[: size != 1]}) is not a multiple of {point_size}; state other columns "
             f"(--columns), or {AGAIN}"
         )
     table = data.reshape(-1, columns)

@@ -267,7 +267,7 @@ class Detector:
         def infer(ready: tuple[_Frame, list[Any]]) -> tuple[_Frame, list[Any]]:
             frame, prepared = ready
             frame.stage_times.append((_WAITING, perf_counter()))
-            return frame, [self.pipeline.infer(each, frame.stage_times) for each in prepared]
+            return frame, [self.pipeline.infer(scan, frame.stage_times) for scan in prepared]
 
         def finish(inferred: tuple[_Frame, list[Any]]) -> ScanDetections:
             frame, raw = inferred
@@ -301,9 +301,9 @@ class Detector:
         return prepared
 
     def _finish(self, frame: _Frame, raw: list[Any]) -> ScanDetections:
-        passes = [self.pipeline.finish(each, frame.stage_times) for each in raw]
+        passes = [self.pipeline.finish(outputs, frame.stage_times) for outputs in raw]
         if self.view == "around":
-            passes = [without_own_vehicle(each) for each in passes]
+            passes = [without_own_vehicle(boxes) for boxes in passes]
         if self.passes == 1:
             detections, counts = passes[0], frame.counts[0]
         else:

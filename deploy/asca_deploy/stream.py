@@ -148,7 +148,7 @@ class _StageThreads(Generic[Scan, Ready, Maps]):
             future, ready = item
             try:
                 with self._inferring:
-                    future.set_result(() if self._left else tuple(self._infer(each) for each in ready))
+                    future.set_result(() if self._left else tuple(self._infer(prepared) for prepared in ready))
             except BaseException as error:
                 future.set_exception(error)
             del item, future, ready

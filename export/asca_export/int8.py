@@ -87,8 +87,8 @@ def round_backbone(
         def canvases() -> Iterator[NDArray[np.uint8]]:
             canvas = Canvas(channels, detector.grid, form)
             return (
-                canvas.scatter(*pool_pillars(each.quantize_features(steps), each.pillars.cells, detector.grid))
-                for each in encoded
+                canvas.scatter(*pool_pillars(scan.quantize_features(steps), scan.pillars.cells, detector.grid))
+                for scan in encoded
             )
 
         return RoundedMaps(FastBackbone(detector, steps), canvases, steps, detector.grid.map_shape, work)
@@ -138,7 +138,7 @@ class RoundedMaps:
 
 class _RoundedSparse:
     def __init__(self, detector: PillarDetector, encoded: Sequence[EncodedScan], steps: CanvasSteps) -> None:
-        samples = [_sample(detector, each).quantize_features(steps) for each in encoded]
+        samples = [_sample(detector, scan).quantize_features(steps) for scan in encoded]
         self._exact = SparseBackbone(detector, steps)
         scale_rows_to_steps(self._exact, samples)
         self._rounded, self.layers = copy.deepcopy(self._exact), list(self._exact.products)
@@ -332,11 +332,11 @@ def quantize_bundle(
     pipeline = runtime.pipeline
     assert isinstance(pipeline, PillarPipeline), "the bundle has just been exported from a pillar detector"
     encoded = [_encode(pipeline, points) for points in chosen_scans.used]
-    steps = canvas_steps(each.features for each in encoded)
+    steps = canvas_steps(scan.features for scan in encoded)
     form = CanvasFormat("uint8", tuple(int(step) for step in steps.empty))
     eight_bit_form = replace(bundle, pillar=replace(bundle.pillar, canvas=form))
     compared = [_encode(pipeline, points) for points in scans]
-    answers = (pipeline.backbone.run(pipeline.backbone.place(each.features, each.pillars.cells)) for each in compared)
+    answers = (pipeline.backbone.run(pipeline.backbone.place(scan.features, scan.pillars.cells)) for scan in compared)
     expected = [answer.maps.scores for answer in answers]
     boxes = [runtime(points) for points in scans]
     with tempfile.TemporaryDirectory() as work:
@@ -346,8 +346,8 @@ def quantize_bundle(
         def error_of(eight_bit: Sequence[str]) -> float:
             rounded.write(trial, eight_bit)
             backbone = open_backbone(trial, eight_bit_form, "cpu", "float32", runtime.threads)
-            placed = (backbone.place(each.quantize_features(steps), each.pillars.cells) for each in compared)
-            actual = (backbone.run(each).maps.scores for each in placed)
+            placed = (backbone.place(scan.quantize_features(steps), scan.pillars.cells) for scan in compared)
+            actual = (backbone.run(scan).maps.scores for scan in placed)
             return logit_error(expected, actual, bundle.spec)
 
         sweep_result = sweep(rounded.layers, error_of, progress)

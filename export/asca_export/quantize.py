@@ -130,7 +130,7 @@ def round_weights(backbone: FastBackbone, layers: Collection[str], moments: Mome
         weight = parameter.T if name == HEAD else parameter.flatten(1)  # (outputs, inputs * window)
         rounded = round_together(weight, moments.squares[name]) if name in layers else weight
         read = (empty / STEP_VALUE).round() * STEP_VALUE
-        sums, rounded_sums = (each.unflatten(1, (len(empty), -1)).sum(dim=2) for each in (weight, rounded))
+        sums, rounded_sums = (values.unflatten(1, (len(empty), -1)).sum(dim=2) for values in (weight, rounded))
         bias.add_(sums @ empty - rounded_sums @ read)
         parameter.copy_(rounded.T if name == HEAD else rounded.reshape(parameter.shape))
 

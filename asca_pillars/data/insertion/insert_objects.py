@@ -285,8 +285,8 @@ def prepare_inserter(
     inserter = Inserter(
         split, insert, spec.ranges, camera_view, data.min_points, prepared, database, tuple(shares.tolist())
     )
-    each = zip(spec.class_names, shares, inserter.candidates, strict=True)
-    for label, (name, share, objects) in enumerate(each):
+    by_class = zip(spec.class_names, shares, inserter.candidates, strict=True)
+    for label, (name, share, objects) in enumerate(by_class):
         if share > 0 and not len(objects):
             raise DatasetError(
                 _nothing_to_insert(split, name, insert.min_points, int((database.labels == label).sum()))

@@ -153,9 +153,9 @@ def _nuscenes_table(report: BoxReport) -> TextTable:
     scores = [item for item in report.nuscenes if item.band == _ALL]
     rows = []
     for item in scores:
-        each = [None] * len(DISTANCES_M) if item.ap_by_distance is None else list(item.ap_by_distance)
+        by_distance = [None] * len(DISTANCES_M) if item.ap_by_distance is None else list(item.ap_by_distance)
         own_errors = (_decimal(item.ate_m), _decimal(item.ase), _decimal(item.aoe_rad))
-        rows.append((item.class_name, _percent(item.ap), *map(_tenth, each), *own_errors))
+        rows.append((item.class_name, _percent(item.ap), *map(_tenth, by_distance), *own_errors))
     mean = ("mean", _percent(_mean([item.ap for item in scores])))
     errors = [_decimal(_mean([getattr(item, name) for item in scores])) for name in ("ate_m", "ase", "aoe_rad")]
     heads = ("class", "AP", *(f"AP\n{limit:g} m" for limit in DISTANCES_M), "ATE\nm", "ASE", "AOE\nrad")

@@ -90,8 +90,10 @@ def _score(pairs: BoxPairs, matches: dict[float, NDArray[np.int64]], name: str, 
         by_distance.append(float(100 * np.maximum(precision[_FIRST:] - _FLOOR, 0).mean() / (1 - _FLOOR)))
         if limit_m == ERROR_DISTANCE_M:
             true = counted & hits
-            each = match_errors(pairs.detections[true], pairs.objects[matched[true]])
-            errors = _mean_errors(each, pairs.scores[true], _at_recalls(counted_hits, pairs.scores[counted], objects))
+            matched_errors = match_errors(pairs.detections[true], pairs.objects[matched[true]])
+            errors = _mean_errors(
+                matched_errors, pairs.scores[true], _at_recalls(counted_hits, pairs.scores[counted], objects)
+            )
     return NuScenesScore(name, band, objects, float(np.mean(by_distance)), tuple(by_distance), *errors)
 
 

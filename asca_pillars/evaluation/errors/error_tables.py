@@ -154,8 +154,8 @@ def _false_rate_table(datasets: Sequence[DatasetErrors], names: Sequence[str]) -
             rates = {} if class_errors is None else {rate.per_frame: rate for rate in class_errors.false_rates}
             if rates:
                 cells = [
-                    f"{rate.score:.2f} ({rate.recall:.2f})" if (rate := rates.get(each)) else _NONE
-                    for each in FALSE_RATES
+                    f"{rate.score:.2f} ({rate.recall:.2f})" if (rate := rates.get(limit)) else _NONE
+                    for limit in FALSE_RATES
                 ]
                 rows.append((name, data.name, *cells))
     title = "Lowest score threshold with at most so many false detections per frame (recall at it)"

@@ -251,9 +251,9 @@ def _voxel_keys(state: Mapping[str, Tensor], our_state: Mapping[str, Tensor]) ->
 
 def _keypoint_keys(model: PvRcnnModel) -> Iterator[KeyMapping]:
     ball = 0
-    for each, widths in zip(model.settings.sources, model.network.source_widths, strict=True):
-        level = "SA_rawpoints" if each.source == "points" else f"SA_layers.{_level(model, each.source)}"
-        for radius in range(len(each.radii_m)):
+    for sa, widths in zip(model.settings.sources, model.network.source_widths, strict=True):
+        level = "SA_rawpoints" if sa.source == "points" else f"SA_layers.{_level(model, sa.source)}"
+        for radius in range(len(sa.radii_m)):
             yield from _ball_keys(f"pfe.{level}.mlps.{radius}", f"encode.balls.{ball}", len(widths))
             ball += 1
     joined = _channels_of(_joined_order(model))
@@ -294,7 +294,7 @@ def _ball_keys(source: str, target: str, layers: int) -> Iterator[KeyMapping]:
 
 
 def _level(model: PvRcnnModel, source: str) -> int:
-    levels = [name for name in LEVEL_SOURCES if name in {each.source for each in model.settings.sources}]
+    levels = [name for name in LEVEL_SOURCES if name in {sa.source for sa in model.settings.sources}]
     return levels.index(source)  # type: ignore[arg-type]
 
 
@@ -308,14 +308,14 @@ def _joined_order(model: PvRcnnModel) -> Tensor:
     """Return for each of our joined channels of a keypoint the index of OpenPCDet's."""
     of_map = _map_order(model)
     widths = {
-        each.source: len(each.radii_m) * widths[-1]
-        for each, widths in zip(model.settings.sources, model.network.source_widths, strict=True)
+        sa.source: len(sa.radii_m) * widths[-1]
+        for sa, widths in zip(model.settings.sources, model.network.source_widths, strict=True)
     }
     starts, start = {}, len(of_map)
     for source in _JOINED:
         starts[source] = start
         start += widths.get(source, 0)
-    orders = [torch.arange(widths[each.source]) + starts[each.source] for each in model.settings.sources]
+    orders = [torch.arange(widths[sa.source]) + starts[sa.source] for sa in model.settings.sources]
     return torch.cat([*orders, of_map])
 
 

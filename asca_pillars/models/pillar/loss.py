@@ -147,8 +147,8 @@ def predicted_ious(residuals: Tensor, targets: TargetBatch) -> Tensor:
     with np.errstate(over="ignore", invalid="ignore"):  # an overflowing box overlaps nothing
         # Half a turn changes no overlap, so the direction that is predicted does not matter.
         predicted, target = (
-            decode_boxes(each.detach().cpu().numpy(), directions, anchors).astype(np.float64)
-            for each in (residuals, targets.residuals)
+            decode_boxes(encoded.detach().cpu().numpy(), directions, anchors).astype(np.float64)
+            for encoded in (residuals, targets.residuals)
         )
         return torch.from_numpy(paired_iou_3d(predicted, target)).to(residuals)
 
@@ -194,8 +194,10 @@ def distillation_loss(maps: HeadMaps[Tensor], teacher: HeadMaps[Tensor], config:
     foreground = scores[:, 0] >= FOREGROUND_SCORE
     weights = scores[foreground]
     total = weights.sum().clamp(min=1.0)
-    residuals, teacher_residuals = (_by_anchor(each.boxes, values=7)[foreground].float() for each in (maps, teacher))
-    directions, bins = (_by_anchor(each.directions, values=2)[foreground].float() for each in (maps, teacher))
+    residuals, teacher_residuals = (
+        _by_anchor(outputs.boxes, values=7)[foreground].float() for outputs in (maps, teacher)
+    )
+    directions, bins = (_by_anchor(outputs.directions, values=2)[foreground].float() for outputs in (maps, teacher))
     box = box_loss(residuals, teacher_residuals, config.smooth_l1_beta, weights)
     direction = weights[:, 0] * F.cross_entropy(directions, torch.softmax(bins, dim=1), reduction="none")
     return DistillationTerms(

@@ -121,9 +121,9 @@ def batch_pillars(frames: Sequence[Pillars], placements: Sequence[Placement] = (
     """
     frame_pillars = [len(frame.cells) for frame in frames]
     starts = np.concatenate([[0], np.cumsum(frame_pillars)[:-1]]).astype(np.int64)
-    poolings = [each.pooling for each in placements if each.pooling is not None]
-    rulebooks = [each.rulebooks for each in placements if each.rulebooks is not None]
-    frame_cells = [len(each.cells) for each in poolings] or frame_pillars
+    poolings = [placement.pooling for placement in placements if placement.pooling is not None]
+    rulebooks = [placement.rulebooks for placement in placements if placement.rulebooks is not None]
+    frame_cells = [len(pooling.cells) for pooling in poolings] or frame_pillars
     return PillarBatch(
         features=torch.from_numpy(np.concatenate([frame.features for frame in frames])),
         pillar_index=torch.from_numpy(
@@ -154,11 +154,11 @@ def _batch_poolings(
 ) -> MapCells[Tensor] | None:
     if not poolings:
         return None
-    rows = [each.pillars + first for each, first in zip(poolings, first_pillars, strict=True)]
+    rows = [pooling.pillars + first for pooling, first in zip(poolings, first_pillars, strict=True)]
     return MapCells(
-        torch.from_numpy(np.concatenate([each.cells for each in poolings])),
+        torch.from_numpy(np.concatenate([pooling.cells for pooling in poolings])),
         torch.from_numpy(np.concatenate(rows)),
-        torch.from_numpy(np.concatenate([each.counts for each in poolings])),
+        torch.from_numpy(np.concatenate([pooling.counts for pooling in poolings])),
     )
 
 

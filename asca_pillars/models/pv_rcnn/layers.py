@@ -369,18 +369,18 @@ class PvRcnn(nn.Module):
         assert isinstance(bev, Tensor)
         context = bev if self.scales is None else torch.cat([self.scales(batch.points, batch.scales), bev], dim=1)
         rows = [
-            SourceRows(where, _source_features(each.source, batch.points, levels))
-            for each, where in zip(self.settings.sources, batch.positions, strict=True)
+            SourceRows(where, _source_features(sa.source, batch.points, levels))
+            for sa, where in zip(self.settings.sources, batch.positions, strict=True)
         ]
         if not self.settings.deformed:
             features, logits = self.encode(rows, batch.keypoints, context, batch.ball_indices)
             return features, logits
         places = self.deformed_positions(batch, levels)
         if self.settings.deform == "authors_frozen":
-            places = {name: [place.detach() for place in each] for name, each in places.items()}
+            places = {name: [place.detach() for place in shifted] for name, shifted in places.items()}
             rows = [
-                SourceRows(given.positions, given.features.detach()) if each.source in places else given
-                for each, given in zip(self.settings.sources, rows, strict=True)
+                SourceRows(given.positions, given.features.detach()) if sa.source in places else given
+                for sa, given in zip(self.settings.sources, rows, strict=True)
             ]
         indices, centers = deformed_balls(batch, self.settings, places)
         features, logits = self.encode(rows, batch.keypoints, context, indices, centers)
@@ -389,19 +389,19 @@ class PvRcnn(nn.Module):
     def deformed_positions(self, batch: VoxelBatch[Tensor], levels: Sequence[Tensor]) -> dict[str, list[Tensor]]:
         """Return shifted positions (K, 3), metres, of keypoints for each deformed source: one, or one per radius."""
         places, first = {}, 0
-        for number, each in enumerate(self.settings.sources):
-            balls = batch.ball_indices[first : first + len(each.radii_m)]
+        for number, sa in enumerate(self.settings.sources):
+            balls = batch.ball_indices[first : first + len(sa.radii_m)]
             first += len(balls)
-            if each in self.settings.deformed:
+            if sa in self.settings.deformed:
                 around = Surroundings(
-                    _source_features(each.source, batch.points, levels),
+                    _source_features(sa.source, batch.points, levels),
                     batch.positions[number],
                     batch.keypoints,
                     balls,
                     batch.nearest[number],
                     batch.nearest_weights[number],
                 )
-                places[str(each.source)] = self.deform[each.source](around)
+                places[str(sa.source)] = self.deform[sa.source](around)
         return places
 
 
@@ -433,12 +433,12 @@ def build_pv_rcnn(model: PvRcnnModel) -> PvRcnn:
         encode=KeypointEncoder(
             [
                 BallSource(
-                    channels[each.source],
-                    len(each.radii_m),
+                    channels[sa.source],
+                    len(sa.radii_m),
                     widths,
-                    gated=each.source == "points" and network.gate == "keypoint",
+                    gated=sa.source == "points" and network.gate == "keypoint",
                 )
-                for each, widths in zip(settings.sources, network.source_widths, strict=True)
+                for sa, widths in zip(settings.sources, network.source_widths, strict=True)
             ],
             map_channels + (network.scale_channels if settings.scale_radii_m else 0),
             network.keypoint_channels,
@@ -452,10 +452,10 @@ def build_pv_rcnn(model: PvRcnnModel) -> PvRcnn:
             dropout=network.dropout,
         ),
         deform={
-            each.source: PaperDeformation(channels[each.source])
+            sa.source: PaperDeformation(channels[sa.source])
             if settings.deform == "paper"
-            else AuthorsDeformation(channels[each.source])
-            for each in settings.deformed
+            else AuthorsDeformation(channels[sa.source])
+            for sa in settings.deformed
         },
         scales=AdaptiveScales(channels["points"], network.scale_widths, network.scale_channels)
         if settings.scale_radii_m

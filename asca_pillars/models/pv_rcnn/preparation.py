@@ -118,12 +118,12 @@ def deformed_balls(
 ) -> tuple[list[Tensor], list[Tensor]]:
     """Return indices (K, samples) and centers (K, 3), metres, of all balls; deformed sources' around `places`."""
     indices, centers, given = [], [], iter(batch.ball_indices)
-    for number, each in enumerate(settings.sources):
-        for radius, (radius_m, samples) in enumerate(zip(each.radii_m, each.samples, strict=True)):
+    for number, sa in enumerate(settings.sources):
+        for radius, (radius_m, samples) in enumerate(zip(sa.radii_m, sa.samples, strict=True)):
             ball_indices = next(given)
-            where = places.get(each.source, [batch.keypoints])
+            where = places.get(sa.source, [batch.keypoints])
             center = where[min(radius, len(where) - 1)]
-            if each.source in places:
+            if sa.source in places:
                 frames = zip(
                     np.split(batch.positions[number].cpu().numpy(), np.cumsum(batch.frame_rows[number])[:-1]),
                     np.split(center.detach().cpu().numpy(), np.cumsum(batch.frame_keypoints)[:-1]),

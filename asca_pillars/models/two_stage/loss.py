@@ -83,7 +83,7 @@ def distance_iou_loss(residuals: Tensor, targets: Tensor, sizes: Tensor) -> Tens
 
     Both boxes as rectangles along the axes of their proposals, which have these sizes: (R, 7), (R, 7), (R, 3) -> (R,).
     """
-    (center, half), (target, target_half) = (_boxes_in_frames(each, sizes) for each in (residuals, targets))
+    (center, half), (target, target_half) = (_boxes_in_frames(encoded, sizes) for encoded in (residuals, targets))
     ends = [
         (at[:, :2] - reach[:, :2], at[:, :2] + reach[:, :2]) for at, reach in ((center, half), (target, target_half))
     ]

@@ -32,7 +32,7 @@ def _are_radii(radii_m: Sequence[float]) -> bool:
 
 @dataclass(frozen=True)
 class SourceBalls(Strict):
-    """Balls of one source that voxel set abstraction aggregates around a keypoint.
+    """Set abstraction (SA) of one source: balls around a keypoint that it aggregates.
 
     Attributes:
         source: raw points, or the voxels of a level of the backbone.
@@ -100,7 +100,7 @@ class VoxelSetSettings(GridSettings):
                 f"scale_radii_m {list(self.scale_radii_m)} must be positive and finite, "
                 f"scale_samples {self.scale_samples} at least 2"
             )
-        names = [each.source for each in self.sources]
+        names = [sa.source for sa in self.sources]
         if len(set(names)) < len(names):
             raise ConfigError(f"sources {', '.join(names)} must be different ones")
         if self.deform != "none" and not self.deformed:
@@ -109,18 +109,18 @@ class VoxelSetSettings(GridSettings):
     @property
     def deformed(self) -> tuple[SourceBalls, ...]:
         """Sources aggregated around shifted positions: the levels, if there is deformation."""
-        return tuple(each for each in self.sources if self.deform != "none" and each.source != "points")
+        return tuple(sa for sa in self.sources if self.deform != "none" and sa.source != "points")
 
     @property
     def needs_three_nearest(self) -> bool:
         """True if the three nearest voxels of a keypoint are needed."""
         return self.deform == "paper"
 
-    def places(self, each: SourceBalls) -> int:
+    def places(self, sa: SourceBalls) -> int:
         """Return the number of shifted positions per keypoint for this source; 0: the keypoint's own position."""
-        if each not in self.deformed:
+        if sa not in self.deformed:
             return 0
-        return 1 if self.deform == "paper" else len(each.radii_m)
+        return 1 if self.deform == "paper" else len(sa.radii_m)
 
 
 class VoxelScan(NamedTuple):
@@ -187,18 +187,15 @@ def with_neighbors(
     features, levels, counts = voxelized
     inside = np.ascontiguousarray(points[spec.grid.inside(points)])
     keypoints = np.ascontiguousarray(inside[farthest_points(inside, settings.keypoints), :3])
-    positions = tuple(_positions(each.source, inside, levels, spec) for each in settings.sources)
+    positions = tuple(_positions(sa.source, inside, levels, spec) for sa in settings.sources)
     balls = tuple(
-        tuple(
-            ball_query(where, keypoints, radius, count)
-            for radius, count in zip(each.radii_m, each.samples, strict=True)
-        )
-        for each, where in zip(settings.sources, positions, strict=True)
+        tuple(ball_query(where, keypoints, radius, count) for radius, count in zip(sa.radii_m, sa.samples, strict=True))
+        for sa, where in zip(settings.sources, positions, strict=True)
     )
     asked = settings.deformed if settings.needs_three_nearest else ()
     nearest = [
-        three_nearest(where, keypoints if each in asked else keypoints[:0])
-        for each, where in zip(settings.sources, positions, strict=True)
+        three_nearest(where, keypoints if sa in asked else keypoints[:0])
+        for sa, where in zip(settings.sources, positions, strict=True)
     ]
     return VoxelScan(
         features,

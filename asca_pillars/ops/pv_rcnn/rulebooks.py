@@ -65,7 +65,7 @@ class VoxelRulebookBuilder:
         for convolution in strided:
             self.maps.append(CellMap(convolution.output_shape(self.maps[-1].shape)))
         self._strided_maps = [
-            build_kernel_map(*each) for each in zip(self.strided, self.maps[:-1], self.maps[1:], strict=True)
+            build_kernel_map(*layer) for layer in zip(self.strided, self.maps[:-1], self.maps[1:], strict=True)
         ]
         self._submanifold_maps = [build_kernel_map(SUBMANIFOLD, level, level) for level in self.maps]
 

@@ -229,4 +229,4 @@ def stack_rows(rulebooks: Sequence[NDArray[np.int32]], rows: Sequence[int]) -> N
 
 def stack_cells(cells: Sequence[NDArray[np.int32]], cells_per_frame: int) -> NDArray[np.int32]:
     """Stack flat indices (M_i,) on each frame's map -> (sum of M_i,) on the maps of all frames, one after the other."""
-    return np.concatenate([each + np.int32(frame * cells_per_frame) for frame, each in enumerate(cells)])
+    return np.concatenate([frame_cells + np.int32(frame * cells_per_frame) for frame, frame_cells in enumerate(cells)])

@@ -47,7 +47,7 @@ class RefineSettings(GridSettings):
         for field in fields(self):
             value = getattr(self, field.name)
             values = value if isinstance(value, tuple) else (value,)
-            if not values or not all(0 < each < math.inf for each in values):
+            if not values or not all(0 < number < math.inf for number in values):
                 raise ConfigError(f"{field.name} {value} of the second stage must be positive and finite")
 
 

@@ -51,7 +51,7 @@ def voxels_interface(bundle: PvRcnnBundle) -> Interface:
     for number, convolution in enumerate(bundle.spec.strided, start=1):
         inputs[f"strided_{number}"] = Tensor("int32", (None, convolution.taps))
     channels = dict(zip((*LEVEL_SOURCES, OUT), bundle.pv_rcnn.voxel_channels, strict=True))
-    read = {each.source for each in bundle.pv_rcnn.settings.sources} | {OUT}
+    read = {sa.source for sa in bundle.pv_rcnn.settings.sources} | {OUT}
     outputs = {name: Tensor("float32", (None, width)) for name, width in channels.items() if name in read}
     return inputs, outputs | {OUT: Tensor(map_type(bundle), (None, channels[OUT]))}
 
@@ -80,14 +80,14 @@ def keypoints_interface(bundle: PvRcnnBundle) -> Interface:
             inputs[f"scale_{number}_positions"] = Tensor("float32", (None, 3))
             inputs[f"scale_{number}_nearest"] = Tensor("int32", (None, 3))
             inputs[f"scale_{number}_nearest_weights"] = Tensor("float32", (None, 3))
-    for each in bundle.pv_rcnn.settings.sources:
-        if each.source != "points":
-            inputs[each.source] = Tensor("float32", (None, channels[each.source]))
-            inputs[f"{each.source}_positions"] = Tensor("float32", (None, 3))
-        for number, samples in enumerate(each.samples):
-            inputs[f"{each.source}_ball_{number}"] = Tensor("int32", (None, samples))
-        for number in range(bundle.pv_rcnn.settings.places(each)):
-            inputs[f"{each.source}_place_{number}"] = Tensor("float32", (None, 3))
+    for sa in bundle.pv_rcnn.settings.sources:
+        if sa.source != "points":
+            inputs[sa.source] = Tensor("float32", (None, channels[sa.source]))
+            inputs[f"{sa.source}_positions"] = Tensor("float32", (None, 3))
+        for number, samples in enumerate(sa.samples):
+            inputs[f"{sa.source}_ball_{number}"] = Tensor("int32", (None, samples))
+        for number in range(bundle.pv_rcnn.settings.places(sa)):
+            inputs[f"{sa.source}_place_{number}"] = Tensor("float32", (None, 3))
     return inputs, {"features": Tensor("float32", (None, bundle.pv_rcnn.keypoint_channels))}
 
 
@@ -96,16 +96,16 @@ def deform_interface(bundle: PvRcnnBundle) -> Interface:
     channels = dict(zip(LEVEL_SOURCES, bundle.pv_rcnn.voxel_channels[:-1], strict=True))
     settings = bundle.pv_rcnn.settings
     inputs, outputs = {"keypoints": Tensor("float32", (None, 3))}, {}
-    for each in settings.deformed:
-        inputs[each.source] = Tensor("float32", (None, channels[each.source]))
-        inputs[f"{each.source}_positions"] = Tensor("float32", (None, 3))
-        for number, samples in enumerate(each.samples):
-            inputs[f"{each.source}_ball_{number}"] = Tensor("int32", (None, samples))
+    for sa in settings.deformed:
+        inputs[sa.source] = Tensor("float32", (None, channels[sa.source]))
+        inputs[f"{sa.source}_positions"] = Tensor("float32", (None, 3))
+        for number, samples in enumerate(sa.samples):
+            inputs[f"{sa.source}_ball_{number}"] = Tensor("int32", (None, samples))
         if settings.needs_three_nearest:
-            inputs[f"{each.source}_nearest"] = Tensor("int32", (None, 3))
-            inputs[f"{each.source}_nearest_weights"] = Tensor("float32", (None, 3))
-        for number in range(settings.places(each)):
-            outputs[f"{each.source}_place_{number}"] = Tensor("float32", (None, 3))
+            inputs[f"{sa.source}_nearest"] = Tensor("int32", (None, 3))
+            inputs[f"{sa.source}_nearest_weights"] = Tensor("float32", (None, 3))
+        for number in range(settings.places(sa)):
+            outputs[f"{sa.source}_place_{number}"] = Tensor("float32", (None, 3))
     return inputs, outputs
 
 
@@ -141,10 +141,10 @@ def keypoint_inputs(
     given: dict[str, NDArray[Any]] = {"points": scan.points, "keypoints": scan.keypoints, "bev": bev}
     for number, scale in enumerate(scan.scales):
         given |= {f"scale_{number}_{part}": array for part, array in scale._asdict().items()}
-    for each, positions, balls in zip(sources, scan.positions, balls_of, strict=True):
-        if each.source != "points":
-            given |= {each.source: levels[each.source], f"{each.source}_positions": positions}
-        given |= {f"{each.source}_ball_{number}": indices for number, indices in enumerate(balls)}
+    for sa, positions, balls in zip(sources, scan.positions, balls_of, strict=True):
+        if sa.source != "points":
+            given |= {sa.source: levels[sa.source], f"{sa.source}_positions": positions}
+        given |= {f"{sa.source}_ball_{number}": indices for number, indices in enumerate(balls)}
     return given
 
 
@@ -153,12 +153,15 @@ def deform_inputs(
 ) -> dict[str, NDArray[Any]]:
     """Return the inputs of deform.onnx: features (N, C) of levels by name, and the keypoints' neighbors."""
     given: dict[str, NDArray[Any]] = {"keypoints": scan.keypoints}
-    for number, each in enumerate(settings.sources):
-        if each in settings.deformed:
-            given |= {each.source: levels[each.source], f"{each.source}_positions": scan.positions[number]}
-            given |= {f"{each.source}_ball_{ball}": index for ball, index in enumerate(scan.ball_indices[number])}
-            given[f"{each.source}_nearest"] = scan.nearest[number]
-            given[f"{each.source}_nearest_weights"] = scan.nearest_weights[number]
+    for number, sa in enumerate(settings.sources):
+        if sa in settings.deformed:
+            given |= {
+                sa.source: levels[sa.source],
+                f"{sa.source}_positions": scan.positions[number],
+            }
+            given |= {f"{sa.source}_ball_{ball}": index for ball, index in enumerate(scan.ball_indices[number])}
+            given[f"{sa.source}_nearest"] = scan.nearest[number]
+            given[f"{sa.source}_nearest_weights"] = scan.nearest_weights[number]
     return given
 
 
@@ -167,15 +170,15 @@ def balls_around(
 ) -> list[list[NDArray[np.int32]]]:
     """Return the ball indices (K, samples) of each source and radius around places (K, 3), metres."""
     balls = []
-    for number, each in enumerate(settings.sources):
-        count = settings.places(each)
+    for number, sa in enumerate(settings.sources):
+        count = settings.places(sa)
         centers = [
-            places[f"{each.source}_place_{min(ball, count - 1)}"] for ball in range(len(each.radii_m) if count else 0)
+            places[f"{sa.source}_place_{min(ball, count - 1)}"] for ball in range(len(sa.radii_m) if count else 0)
         ]
         balls.append(
             [
                 ball_query(scan.positions[number], center, radius_m, samples)
-                for center, radius_m, samples in zip(centers, each.radii_m, each.samples, strict=True)
+                for center, radius_m, samples in zip(centers, sa.radii_m, sa.samples, strict=True)
             ]
             if count
             else list(scan.ball_indices[number])

@@ -83,4 +83,4 @@ def _export_graphs(
     backbone = SparseBackbone(detector)
     export_sparse_backbone(backbone, path)
     rulebooks = [preparation.place(preparation.spec.pillarize(scan)).rulebooks for scan in scans]
-    return float(np.mean([sparse_multiply_accumulates(backbone, each) for each in rulebooks if each is not None])) / 1e9
+    return float(np.mean([sparse_multiply_accumulates(backbone, scan) for scan in rulebooks if scan is not None])) / 1e9

@@ -98,9 +98,9 @@ def _places(network: PvRcnn, batch: VoxelBatch[torch.Tensor], levels: Sequence[t
     with torch.inference_mode():
         places = network.deformed_positions(batch, levels)
     return {
-        f"{name}_place_{number}": each.numpy()
+        f"{name}_place_{number}": place.numpy()
         for name, indices in places.items()
-        for number, each in enumerate(indices)
+        for number, place in enumerate(indices)
     }
 
 

@@ -225,7 +225,7 @@ def export_deform(network: PvRcnn, bundle: PvRcnnBundle, path: Path) -> None:
 
 def _source_rows(inputs: Mapping[str, Declared], sources: Sequence[SourceBalls]) -> dict[str, str]:
     """Return by input what its rows are: voxels of a source, positions of a scale, or keypoints."""
-    of_source = {f"{each.source}{suffix}": each.source for each in sources for suffix in ("", "_positions")}
+    of_source = {f"{sa.source}{suffix}": sa.source for sa in sources for suffix in ("", "_positions")}
     return {name: of_source.get(name) or _scale_row(name) or "keypoints" for name in inputs}
 
 
@@ -249,15 +249,15 @@ class _Keypoints(nn.Module):
         rows, indices, centers, left = [], [], [], iter(rest)
         if self.scales is not None:
             bev = torch.cat([self.scales(points, self._point_scales(keypoints, left)), bev], dim=1)
-        for each in self.settings.sources:
-            if each.source == "points":
+        for sa in self.settings.sources:
+            if sa.source == "points":
                 rows.append(SourceRows(points[:, :3], points[:, 3:]))
             else:
                 features = next(left)
                 rows.append(SourceRows(next(left), features))
-            indices += [next(left) for _ in each.radii_m]
-            places = [next(left) for _ in range(self.settings.places(each))] or [keypoints]
-            centers += [places[min(ball, len(places) - 1)] for ball in range(len(each.radii_m))]
+            indices += [next(left) for _ in sa.radii_m]
+            places = [next(left) for _ in range(self.settings.places(sa))] or [keypoints]
+            centers += [places[min(ball, len(places) - 1)] for ball in range(len(sa.radii_m))]
         features, _ = self.encode(rows, keypoints, bev, indices, centers)
         return features
 
@@ -280,11 +280,11 @@ class _Deform(nn.Module):
     def forward(self, *inputs: Tensor) -> tuple[Tensor, ...]:
         keypoints, *rest = inputs
         left, places = iter(rest), []
-        for each in self.settings.deformed:
+        for sa in self.settings.deformed:
             features, positions = next(left), next(left)
-            balls = [next(left) for _ in each.radii_m]
+            balls = [next(left) for _ in sa.radii_m]
             nearest = (next(left), next(left)) if self.settings.needs_three_nearest else ()
-            places += self.deform[each.source](Surroundings(features, positions, keypoints, balls, *nearest))
+            places += self.deform[sa.source](Surroundings(features, positions, keypoints, balls, *nearest))
         return tuple(places)
 
 
