@@ -30,8 +30,7 @@ OPSET = 20
 _EXAMPLE_ROWS = 6  # rows of the traced example; dynamic in the graph
 LOWEST = -3.0e38  # below any feature; every pillar holds a point, so it never survives the max
 PIECES = 4
-"""Parts of a scan's points whose features are computed and reduced one after the other, so that they stay in the
-cache."""
+"""Parts of a scan's points that the encoder computes and reduces one after the other: each fits into the cache."""
 
 
 def export_encoder(encode: nn.Module, path: Path) -> None:
@@ -190,25 +189,25 @@ def _scatter_max(features: Any, pillar_index: Any, point_counts: Any) -> Any:
     """Translate `models.pillar.encoder.pillar_max` to ONNX: ScatterND with a max is the fastest form."""
     shape = op.Concat(op.Shape(point_counts), op.Shape(features, start=1), axis=0)
     lowest = op.Expand(op.Constant(value_float=LOWEST), shape)
-    return op.ScatterND(lowest, op.Unsqueeze(pillar_index, op.Constant(value_ints=[1])), features, reduction="max")
+    return op.ScatterND(lowest, op.Unsqueeze(pillar_index, _integer(1)), features, reduction="max")
 
 
 def _product_max(features: Any, weight: Any, pillar_index: Any, point_counts: Any) -> Any:
     """Translate `fast_forms.product_max` to ONNX: PIECES of about as many points, cut between two pillars."""
-    points, pillar, row, pieces = op.Shape(pillar_index), _integers(0), _integers(0), []
+    points, pillar, row, pieces = op.Shape(pillar_index), _integer(0), _integer(0), []
     for piece in range(1, PIECES + 1):
-        place = op.Div(op.Mul(points, _integers(piece)), _integers(PIECES))
+        place = op.Div(op.Mul(points, _integer(piece)), _integer(PIECES))
         last = op.Shape(point_counts) if piece == PIECES else op.Gather(pillar_index, place)
         counts = op.Slice(point_counts, pillar, last)
-        end = op.Add(row, op.ReduceSum(counts, _integers(0)))
+        end = op.Add(row, op.ReduceSum(counts, _integer(0)))
         index = op.Sub(op.Slice(pillar_index, row, end), pillar)
         pieces.append(_scatter_max(op.MatMul(op.Slice(features, row, end), weight), index, counts))
         pillar, row = last, end
     return op.Concat(*pieces, axis=0)
 
 
-def _integers(*values: int) -> Any:
-    return op.Constant(value_ints=values)
+def _integer(value: int) -> Any:
+    return op.Constant(value_ints=[value])
 
 
 def _forget_origin(graph: Any) -> None:

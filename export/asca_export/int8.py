@@ -347,7 +347,7 @@ def quantize_bundle(
             rounded.write(trial, eight_bit)
             backbone = open_backbone(trial, eight_bit_form, "cpu", "float32", runtime.threads)
             placed = (backbone.place(scan.quantize_features(steps), scan.pillars.cells) for scan in compared)
-            actual = (backbone.run(scan).maps.scores for scan in placed)
+            actual = (backbone.run(inputs).maps.scores for inputs in placed)
             return logit_error(expected, actual, bundle.spec)
 
         sweep_result = sweep(rounded.layers, error_of, progress)

@@ -105,12 +105,12 @@ class PillarBackbone(Protocol):
         """Name of the stage `place` in reports."""
 
     def build_rulebooks(self, cells: NDArray[np.int64]) -> NeckRulebooks[NDArray[np.int32]] | None:
-        """Build what the graph takes of the flat cell indices (P,) alone, beside the encoder; None if it is nothing."""
+        """Build the rulebooks of flat cell indices (P,), in any thread; None for a dense neck."""
 
     def place(self, pillar_features: NDArray[Any], cells: NDArray[np.int64], rulebooks: Any = None) -> Any:
         """Place pillar features (P, C), in the bundle's type, at flat cell indices (P,): the graph's input.
 
-        `rulebooks` are those that `build_rulebooks` has returned for the cells; they are built here without.
+        `rulebooks` is the result of `build_rulebooks` for these cells; if it is None, they are built here.
         """
 
     def run(self, placed: Any) -> HeadOutputs:

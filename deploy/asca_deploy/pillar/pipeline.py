@@ -79,7 +79,7 @@ class PillarPipeline:
         """Prepare the backbone's input from points (N, 4), metres, LiDAR frame, and reflectance."""
         pillars = self.pillarize(points)
         stage_times.append(("pillarize", perf_counter()))
-        # The encoder has one thread, see `open_encoder`.
+        # The encoder runs on one thread, see `open_encoder`: another core builds the rulebooks meanwhile.
         building = self._executor and self._executor.submit(self.backbone.build_rulebooks, pillars.cells)
         features = self.encode(pillars)
         stage_times.append(("encode", perf_counter()))

@@ -83,4 +83,5 @@ def _export_graphs(
     backbone = SparseBackbone(detector)
     export_sparse_backbone(backbone, path)
     rulebooks = [preparation.place(preparation.spec.pillarize(scan)).rulebooks for scan in scans]
-    return float(np.mean([sparse_multiply_accumulates(backbone, scan) for scan in rulebooks if scan is not None])) / 1e9
+    counts = [sparse_multiply_accumulates(backbone, built) for built in rulebooks if built is not None]
+    return float(np.mean(counts)) / 1e9
