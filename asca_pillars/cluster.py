@@ -116,12 +116,12 @@ class ShardFolder:
                 yield from self._lines(shard)
             except _DamagedError:
                 raise OutputError(
-                    f"{self._file(shard)}: is damaged; give the same command again, and its items are done again"
+                    f"{self._file(shard)}: is damaged; run the same command again, which redoes its items"
                 ) from None
             except FileNotFoundError:
                 raise OutputError(
-                    f"{self._file(shard)}: a worker has written it, and it is not to be seen here; give a folder that "
-                    "is the same on every machine, then the same command again"
+                    f"{self._file(shard)}: a worker has written it, but it is not visible here; give a folder that "
+                    "every machine mounts at the same path, then run the same command again"
                 ) from None
 
     def _is_whole(self, shard: Shard) -> bool:
@@ -347,7 +347,7 @@ def _on_worker(job: Callable[[Shard], Result], shard: Shard, seen: Path, version
     if (local := _version()) != version:
         raise ClusterError(f"{host}: has asca-pillars {local}, the command {version}; install one version everywhere")
     if not seen.is_file():
-        raise ClusterError(f"{host}: does not see {seen}; write to a folder that every machine mounts at that place")
+        raise ClusterError(f"{host}: does not see {seen}; write to a folder that every machine mounts at the same path")
     return job(shard)
 
 
@@ -394,7 +394,7 @@ def run_shards(
             if not pool.fits():
                 needed = f"{cpus} CPU{'s'[: cpus > 1]}" + (" and a GPU" if gpus else "")
                 reporter.remark(
-                    f"no machine of the cluster has {needed}, which each worker takes: waiting for one to join"
+                    f"no machine of the cluster has {needed}, which each worker needs: waiting for one to join"
                 )
             for outcome in process_shards(shards, pool):
                 done += len(outcome.shard.items)

@@ -86,7 +86,7 @@ def test_a_damaged_result_is_done_again_and_not_merged(tmp_path: Path, damage: C
     path = tmp_path / f"{shards[0].name}.jsonl"
     path.write_bytes(damage(path.read_bytes()))
     assert folder.done(shards) == {shards[1].name}
-    with pytest.raises(OutputError, match=r"000000000-\w+\.jsonl: is damaged; give the same command again"):
+    with pytest.raises(OutputError, match=r"000000000-\w+\.jsonl: is damaged; run the same command again"):
         list(folder.lines(shards))
 
 
@@ -95,7 +95,7 @@ def test_a_result_that_is_not_there_or_of_another_shard_is_none(tmp_path: Path) 
     folder.write(shards[0], ["1\n", "2\n"])
     (tmp_path / f"{shards[0].name}.jsonl").rename(tmp_path / f"{shards[1].name}.jsonl")
     assert folder.done(shards) == set()
-    with pytest.raises(OutputError, match=r"000000003-\w+\.jsonl: .* the same on every machine"):
+    with pytest.raises(OutputError, match=r"000000003-\w+\.jsonl: .* mounts at the same path"):
         list(folder.lines([Shard(3, ("a",))]))
 
 

@@ -85,7 +85,7 @@ class _CheckedCache(FunctionCache):
         except OSError as error:
             if not _CheckedCache.warned:
                 _log.warning(
-                    "%s: what was compiled cannot be kept (%s), so that every process compiles for some seconds; make "
+                    "%s: compiled code cannot be cached (%s), so that every process compiles for some seconds; make "
                     "room there, or set NUMBA_CACHE_DIR to another folder",
                     *(self.cache_path, error.strerror or error),
                 )

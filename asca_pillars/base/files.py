@@ -51,11 +51,11 @@ def require_content(path: str | Path, error: type[AscaError]) -> None:
         return
     for is_kind, name in _KINDS:
         if is_kind(status.st_mode):
-            raise error(f"{path}: is {name} and no regular file; write its content to a file and give that")
+            raise error(f"{path}: is {name}, not a regular file; copy its content to a file and give that")
     if stat.S_ISREG(status.st_mode) and status.st_size <= _LARGEST_POINTER_BYTES:
         with Path(path).open("rb") as file:
             if file.read(len(_LFS_POINTER)) == _LFS_POINTER:
-                raise error(f"{path}: is a pointer of Git LFS, its content was not fetched; run `git lfs pull`")
+                raise error(f"{path}: is a Git LFS pointer whose content was not fetched; run `git lfs pull`")
 
 
 def read_text(path: str | Path, error: type[AscaError], *, errors: str = "strict") -> str:
@@ -95,7 +95,9 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     """
     target = _prepare(path)
     if target.exists() and not target.is_file():
-        raise OutputError(f"{path}: is {'a folder' if target.is_dir() else 'no regular file'}; choose a file's name")
+        raise OutputError(
+            f"{path}: is {'a folder' if target.is_dir() else 'not a regular file'}; choose the name of a file"
+        )
     longest = _LONGEST_NAME_BYTES - len(".12345678.asca-") - len(os.fsencode(target.suffix))
     stem = os.fsencode(target.stem)[:longest].decode(errors="ignore")
     with _with_path_in_errors(path), _temporary(target, stem, target.suffix, folder=False) as temporary:

@@ -107,7 +107,9 @@ def require_own_file(
     if not path.exists():
         return
     if not path.is_file():
-        raise OutputError(f"{path}: is {'a folder' if path.is_dir() else 'no regular file'}; choose a file's name")
+        raise OutputError(
+            f"{path}: is {'a folder' if path.is_dir() else 'not a regular file'}; choose the name of a file"
+        )
     require_not_input(path, inputs)
     if path.stat().st_size and not is_own(path):
         raise OutputError(
@@ -209,7 +211,7 @@ def require_not_input(target: str | Path, inputs: Iterable[str | Path | None]) -
             continue
         read = Path(given).resolve()
         if Path(target).resolve() in (read, *read.parents):
-            raise OutputError(f"{target}: would replace {given}, which is read; choose another place to write to")
+            raise OutputError(f"{target}: would replace the input {given}; write to another place")
 
 
 def _has(content: bytes, keys: Iterable[str], values: Mapping[str, Any]) -> bool:
@@ -225,7 +227,7 @@ def _has(content: bytes, keys: Iterable[str], values: Mapping[str, Any]) -> bool
 def _entries(folder: Path) -> list[Path]:
     """List what is in a folder, without what is being written just now; nothing if there is no folder."""
     if folder.is_symlink() and not folder.exists():
-        raise OutputError(f"{folder}: is a link to nothing; make the folder that it leads to, or choose another one")
+        raise OutputError(f"{folder}: is a broken link; create the folder that it points to, or choose another one")
     if folder.exists() and not folder.is_dir():
         raise OutputError(f"{folder}: is a file where a folder is to be written; choose another name")
     return sorted(path for path in folder.glob("*") if not is_temporary(path.name)) if folder.exists() else []

@@ -121,7 +121,8 @@ def _ordered_results(todo: Sequence[Any], at_once: int, pool: _Pool) -> Iterator
             except (EOFError, ConnectionError):
                 dead = sum(process.exitcode is not None for process in pool.values()) or 1
                 raise WorkerError(
-                    f"{dead} of {len(pool)} worker processes were killed, perhaps for want of memory; use fewer workers"
+                    f"{dead} of {len(pool)} worker processes were killed, perhaps because memory ran out; "
+                    "use fewer workers"
                 ) from None
         for result in done.pop(next_index):
             if isinstance(result, _Failed):

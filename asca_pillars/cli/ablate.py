@@ -26,10 +26,10 @@ def ablate(
     ],
     override: OverridesOption = None,
     seeds: Annotated[
-        str, typer.Option("--seeds", help="Seeds of every variant, with commas between them.", rich_help_panel="Input")
+        str, typer.Option("--seeds", help="Seeds of every variant, separated by commas.", rich_help_panel="Input")
     ] = "0,1",
     variants: Annotated[
-        str, typer.Option("--variants", help="Names with commas between them, or all.", rich_help_panel="Input")
+        str, typer.Option("--variants", help="Names separated by commas, or all.", rich_help_panel="Input")
     ] = "all",
     init: InitOption = None,
     out: Annotated[

@@ -95,7 +95,7 @@ def parse_seeds(text: str) -> list[int]:
     parts = [part.strip() for part in text.split(",")]
     seeds = [int(part) for part in parts if part.isdecimal()]
     if len(set(seeds)) < len(parts):
-        raise ConfigError(f"--seeds {text}: different whole numbers with commas between them, such as 0,1")
+        raise ConfigError(f"--seeds {text}: give different whole numbers separated by commas, such as 0,1")
     return seeds
 
 
@@ -121,7 +121,7 @@ def parse_variants(text: str, family: Family) -> list[Row]:
     names = list(variants) if text == "all" else text.split(",")
     for name in names:
         if name not in variants:
-            raise ConfigError(f"--variants {name}: no such variant; there are {', '.join(variants)}")
+            raise ConfigError(f"--variants {name}: no such variant; available: {', '.join(variants)}")
         if names.count(name) > 1:
             raise ConfigError(f"--variants {text}: {name} is there twice")
     return [variants[name] for name in names]

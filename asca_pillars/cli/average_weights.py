@@ -72,7 +72,7 @@ def average_weights(
     try:
         given = None if shares is None else [float(share) for share in shares.split(",")]
     except ValueError:
-        raise ConfigError(f"--shares {shares}: give numbers and commas, such as 0.7,0.3") from None
+        raise ConfigError(f"--shares {shares}: give numbers separated by commas, such as 0.7,0.3") from None
     paths = [find_checkpoint(checkpoint) for checkpoint in checkpoints]
     bundle = bundle_of_checkpoint(checkpoints[0])
     console = Console(markup=False, soft_wrap=True)

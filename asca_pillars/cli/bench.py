@@ -147,13 +147,13 @@ def bench(
     console = Console(markup=False, highlight=False, width=120 if piped else None)
     logging.getLogger("asca_pillars").setLevel(logging.ERROR)  # no warnings of unusual scans, as in `asca detect`
     if around and (matrix or cold):
-        raise ConfigError("--matrix and --cold time single passes: leave --around out, or them")
+        raise ConfigError("--matrix and --cold time single passes; leave them out, or --around")
     settings = scan_settings(
         sensor_height=sensor_height, axes=axes, pose=pose, reflectance_scale=reflectance_scale, columns=columns
     )
     if recordings := [path for path in scans or () if is_recording(path)]:
         if len(scans or ()) > 1:
-            raise ConfigError(f"{recordings[0]}: is a recording; give one alone")
+            raise ConfigError(f"{recordings[0]}: is a recording, which must be the only input")
         require("recordings")
         with Bars(Console(markup=False), transient=True) as bars:
             recording = open_recording(recordings[0], Reporter(bars))

@@ -212,7 +212,7 @@ def detect(
     if recordings:
         _refuse_times(rate, times)
         if cluster is not None or len(scans or ()) > 1:
-            raise ConfigError(f"{recordings[0]}: is a recording; give one alone, without --cluster")
+            raise ConfigError(f"{recordings[0]}: is a recording, which must be the only input, without --cluster")
         if pictures:
             raise ConfigError("--pictures: scans of a recording are not drawn; leave it out, or give --rerun FILE")
         if columns is not None:
@@ -251,13 +251,13 @@ def detect(
 
         if video is not None or video_view != "above":
             option = f"--video-view {video_view}" if video is None else f"--video {video}"
-            raise ConfigError(f"{option}: is not made with --cluster; leave one of them out")
+            raise ConfigError(f"{option}: cannot be combined with --cluster; leave one of them out")
         if track or rate is not None or times or foxglove or rerun:
             raise ConfigError(
-                "--track, --rate, --times, --foxglove and --rerun do not go with --cluster; leave them out"
+                "--track, --rate, --times, --foxglove and --rerun cannot be combined with --cluster; leave them out"
             )
         if pictures:
-            raise ConfigError("--pictures: are not drawn with --cluster; leave one of them out")
+            raise ConfigError("--pictures: cannot be combined with --cluster; leave one of them out")
         paths = [scan.path for scan in name_scans(scans or [sample_scan_path()])]
         with Bars(console, transient=True) as bars:
             archive = detect_archive(
@@ -358,7 +358,7 @@ def _print_archive(result: "ArchiveResult", out: Path, console: "Console") -> No
     if result.done_before:
         console.print(f"{result.done_before} scans were done by an earlier run", highlight=False)
     if result.repeats:
-        console.print(f"{result.repeats} shards were begun again after their worker had died", highlight=False)
+        console.print(f"{result.repeats} shards were restarted after their worker died", highlight=False)
     console.print(f"{detected} scans: {out / RUN_FILE}", highlight=False, soft_wrap=True)
     if unreadable:
         named = out / UNREADABLE_FILE

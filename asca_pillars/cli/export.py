@@ -192,15 +192,15 @@ def _print_quantization(report: "Quantization", console: "Console") -> None:
     if report.dropped_scans:
         console.print(f"{report.dropped_scans} calibration scans left out: parity is proven on the same ones")
     table.add_column("layer")
-    table.add_column("logit error if it alone stays float", justify="right")
+    table.add_column("logit error if only it stays float", justify="right")
     table.add_column("kept float")
     for layer in report.layers:
         table.add_row(layer.layer, f"{layer.logit_rms_error:.4f}", "yes" if layer.kept_float else "")
     console.print(table)
     console.print(
-        f"Logit error {report.logit_rms_error:.4f}; of {report.boxes} boxes on {report.compared_scans} scans "
-        f"{report.boxes_matched} are there again, {report.boxes_added} are new. "
-        "What that costs in AP says `asca eval` on both bundles"
+        f"Logit error {report.logit_rms_error:.4f}; {report.boxes_matched} of {report.boxes} boxes on "
+        f"{report.compared_scans} scans remain, {report.boxes_added} are new. "
+        "`asca eval` on both bundles shows the difference in AP"
     )
 
 
@@ -236,7 +236,7 @@ def _export_for_runtime(
     from asca_pillars.scans.find_scans import find_scans
 
     if golden == browser or (ort_web is not None and not browser):
-        raise ConfigError("give one of --golden and --browser; --ort-web goes with --browser")
+        raise ConfigError("give either --golden or --browser; --ort-web is for --browser")
     if given := [name for name, value in of_a_checkpoint.items() if value]:
         raise ConfigError(f"{given[0]} is for a checkpoint, and --golden and --browser read a bundle; leave it out")
     folder = find_bundle(bundle)

@@ -84,11 +84,11 @@ def import_dataset(
     from asca_pillars.scans.scan_settings import ScanSettings
 
     if source_format not in FORMATS:
-        raise ConfigError(f"--from {source_format}: no such format; there are {', '.join(FORMATS)}")
+        raise ConfigError(f"--from {source_format}: no such format; available: {', '.join(FORMATS)}")
     form = FORMATS[source_format]
     if (scans is not None) != form.scans_elsewhere:
         those = ", ".join(name for name, layout in FORMATS.items() if layout.scans_elsewhere)
-        raise ConfigError(f"--scans FOLDER goes with --from {those}, and only with them: others say where scans are")
+        raise ConfigError(f"--scans FOLDER is for --from {those}, which need it; other formats say where scans are")
     if not source.exists():
         raise ConfigError(f"{source}: no such file or folder; check the path")
     if wrong := [text for text in rename or () if not all(text.partition("="))]:
@@ -100,7 +100,9 @@ def import_dataset(
         sensor_height=sensor_height, axes=axes, pose=pose, reflectance_scale=reflectance_scale, columns=columns
     )
     if scans is None and settings != ScanSettings():
-        raise ConfigError(f"--from {source_format} knows how its scans lie: leave --axes, --columns and the like out")
+        raise ConfigError(
+            f"--from {source_format} defines the axes of its scans; leave out --axes, --columns and the like"
+        )
     console = Console(markup=False, highlight=False)
     with Bars(console, transient=True) as bars:
         imported = form.read(source, out=out, scans=scans, settings=settings, reporter=Reporter(bars))

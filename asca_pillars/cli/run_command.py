@@ -31,8 +31,8 @@ def run_command(command: Callable[..., object], name: str | None = None) -> None
         message = f"{error.filename}: {reason}" if error.filename else reason
         _fail(name, message, INPUT if missing else ENVIRONMENT)
     except MemoryError as error:
-        reason = str(error) or "no more is to be had"
-        _fail(name, f"not enough memory ({reason}); give it smaller input, or more memory", ENVIRONMENT)
+        reason = str(error) or "allocation failed"
+        _fail(name, f"out of memory ({reason}); use a smaller input, or a machine with more memory", ENVIRONMENT)
     except RecursionError:
         _fail(name, "the input is nested too deeply to be read; simplify the file or the option", INPUT)
 

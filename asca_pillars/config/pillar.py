@@ -41,7 +41,7 @@ class NetworkConfig(Strict):
         require_bounds("model.network", self, ("pillar_channels", "block_channels", "upsample_channels"), low=1)
         require_bounds("model.network", self, ("block_convs",), low=0)
         if self.empty_slots and self.cpa == "point":
-            raise ConfigError("model.network.empty_slots does not go with cpa point; choose another of them")
+            raise ConfigError("model.network.empty_slots cannot be combined with cpa point; change one of them")
         if self.neck == "sparse" and self.active_cells == "fine" and not self.block_convs[0]:
             raise ConfigError(
                 "model.network.active_cells = fine grows in the first block's stride-1 convolutions, of which "
@@ -104,5 +104,5 @@ class PillarModel(Strict):
         if self.network.cpa == "paper" and self.spec.limits.max_pillars < TRACED_PILLARS:
             raise ConfigError(
                 f"model.spec.limits.max_pillars = {self.spec.limits.max_pillars}: must be at least {TRACED_PILLARS} "
-                "with cpa paper, which has weights for so many pillars and no more"
+                "with cpa paper, whose weights are for exactly so many pillars"
             )

@@ -203,7 +203,7 @@ class Config(Strict):
     def __post_init__(self) -> None:
         proportions, names = self.augment.insert.proportions, self.model.spec.class_names
         if unknown := [name for name in proportions if name not in names]:
-            raise ConfigError(f"augment.insert.proportions.{unknown[0]}: no such class; there are {', '.join(names)}")
+            raise ConfigError(f"augment.insert.proportions.{unknown[0]}: no such class; available: {', '.join(names)}")
         if proportions and not any(proportions.values()):
             raise ConfigError("augment.insert.proportions: all are 0; set augment.insert.method=none to insert nothing")
         if isinstance(self.model, RefineModel):

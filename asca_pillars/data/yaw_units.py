@@ -17,7 +17,7 @@ def yaw_error(yaw: float) -> str | None:
     """Return an error clause for a yaw that cannot be in radians; None if it can."""
     if abs(yaw) <= LARGEST_YAW_RAD:
         return None
-    return f"is {yaw:g}, more than a turn of 6.28: radians are wanted; multiply degrees by pi / 180 (0.0174533)"
+    return f"is {yaw:g}, more than a full turn (6.28): give radians; multiply degrees by pi / 180 (0.0174533)"
 
 
 def check_yaws(yaws: Sequence[ArrayLike]) -> str | None:
@@ -34,6 +34,6 @@ def check_yaws(yaws: Sequence[ArrayLike]) -> str | None:
         return None
     examples: NDArray[np.float64] = np.unique(np.round(stated[np.arange(len(values)), off.argmin(axis=1)]))
     return (
-        f"all {len(values)} yaws that are not 0 are whole numbers, such as {examples[-1]:g}: radians are wanted; if "
-        "they are degrees, multiply them by pi / 180 (0.0174533)"
+        f"all {len(values)} yaws that are not 0 are whole numbers, such as {examples[-1]:g}: yaws must be in radians; "
+        "if they are degrees, multiply them by pi / 180 (0.0174533)"
     )

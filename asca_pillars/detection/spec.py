@@ -79,7 +79,7 @@ class DetectorSpec(Strict, ABC):
         if wrong := [value for value in scores.values() if not isinstance(value, int | float | np.number)]:
             raise ConfigError(f"score_threshold {wrong[0]!r}: give a number between 0 and 1")
         if unknown := [name for name in scores if name not in self.class_names]:
-            raise ConfigError(f"{unknown[0]}: no such class; there are {', '.join(self.class_names)}")
+            raise ConfigError(f"{unknown[0]}: no such class; available: {', '.join(self.class_names)}")
         return replace(
             self,
             classes=tuple(

@@ -54,7 +54,7 @@ def model_scores(model: Model, score: ScoreThresholds | None, min_score: float) 
     scores = scores_by_class(score, {item.name: item.score_threshold for item in model.spec.classes})
     for name, fixed in scores.items():
         if fixed > 1:
-            raise ConfigError(f"--score {fixed:g}: no detection of a model has such a score; at most 1")
+            raise ConfigError(f"--score {fixed:g}: scores of a model are at most 1")
         if fixed < min_score:
             raise ConfigError(
                 f"score {fixed:g} of {name} is below --min-score {min_score:g}, the lowest that {model.name} is "
@@ -72,7 +72,7 @@ def scores_by_class(stated: ScoreThresholds | None, defaults: Mapping[str, float
     if not isinstance(stated, Mapping):
         return dict(defaults) if stated is None else dict.fromkeys(defaults, stated)
     if unknown := [name for name in stated if name not in defaults]:
-        raise ConfigError(f"--score {unknown[0]}: no such class; there are {', '.join(defaults)}")
+        raise ConfigError(f"--score {unknown[0]}: no such class; available: {', '.join(defaults)}")
     return dict(defaults) | dict(stated)
 
 

@@ -107,5 +107,5 @@ def _require_common_class(frames: BoxFrames, class_names: tuple[str, ...], data:
     if not set(labelled) & set(class_names):
         raise DatasetError(
             f"{data}: labels are of {', '.join(labelled) or 'nothing'}, predictions of "
-            f"{', '.join(class_names) or 'nothing'}: no class in common; name them alike"
+            f"{', '.join(class_names) or 'nothing'}: no class in common; give them the same names"
         )

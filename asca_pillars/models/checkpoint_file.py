@@ -57,7 +57,7 @@ def read_checkpoint(path: str | Path) -> CheckpointFile:
     try:
         content = read_plain(path)
         if "hyper_parameters" not in content and (library := _library_of(content)):
-            raise TrainingError(f"{path}: a checkpoint of {library}; `asca import-weights` makes one of ours of it")
+            raise TrainingError(f"{path}: a checkpoint of {library}; convert it with `asca import-weights`")
         config = parse(Config, content["hyper_parameters"]["config"], str(path))
         weights = {
             name.removeprefix("detector."): value
@@ -142,7 +142,7 @@ def require_new_checkpoint(path: Path) -> None:
     if path.suffix != Path(WEIGHTS_FILE).suffix:
         raise OutputError(f"{path}: give a name that ends in .ckpt, by which the other commands know a checkpoint")
     if path.exists():
-        raise OutputError(f"{path}: is there already, and a training may need it; choose another name, or remove it")
+        raise OutputError(f"{path}: already exists, and a training run may need it; choose another name, or remove it")
 
 
 def require_same_arrays(

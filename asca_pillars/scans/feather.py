@@ -50,7 +50,7 @@ def feather_table(
         table = feather.read_table(path, memory_map=False)
     except (pyarrow.ArrowException, OSError) as reason:
         raise error(
-            f"{path}: no readable feather file ({' '.join(str(reason).split())[:100]}); copy it again"
+            f"{path}: not a readable feather file ({' '.join(str(reason).split())[:100]}); copy it again"
         ) from None
     if missing := [name for name in (*numbers, *texts) if name not in table.column_names]:
         raise error(

@@ -156,8 +156,8 @@ def _measure_candidate(
 
 def _skip_reason(provider: str, elapsed_s: float) -> str | None:
     if provider in SLOW_START:
-        return "left out, it takes up to minutes to start: ask for it by name"
-    return f"not tried, {BUDGET_S:g} s were over: ask for it by name" if elapsed_s > BUDGET_S else None
+        return "skipped, it takes up to minutes to start: request it by name"
+    return f"not tried, the {BUDGET_S:g} s for trials were over: request it by name" if elapsed_s > BUDGET_S else None
 
 
 def _median_ms(detect: Callable[[Network], Detections], network: Network, clock: Callable[[], float]) -> float:

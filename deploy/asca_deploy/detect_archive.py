@@ -63,7 +63,7 @@ class ArchiveResult:
     Attributes:
         counts: of all scans.
         done_before: scans that an earlier run had done.
-        repeats: how often shards were begun again after their worker had died.
+        repeats: how often shards were restarted after their worker died.
     """
 
     counts: ArchiveCounts

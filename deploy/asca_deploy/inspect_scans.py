@@ -76,7 +76,7 @@ class ScansInspection:
         inside_share: share of a scan's points within `ranges`, 0..1.
         height: of the sensor above the ground; None if it cannot be estimated, which is then among the findings.
         notes: sentences about how a recording is read: that it was unpacked.
-        findings: sentences about what is odd; those about the model's training name the option that mends it.
+        findings: sentences about what is odd; those about the model's training name the option that corrects it.
         problems: sentences about scans and parts of the recording that cannot be read.
     """
 

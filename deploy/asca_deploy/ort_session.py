@@ -115,7 +115,7 @@ class OrtSession:
         """See `graph.Session.run`: inputs and outputs of the shapes that the graph declares.
 
         Raises:
-            ProviderError: it fails on other hardware than the CPU, for example for want of memory.
+            ProviderError: it fails on other hardware than the CPU, for example because memory ran out.
             BundleError: it fails on the CPU.
         """
         try:
@@ -124,7 +124,7 @@ class OrtSession:
             reason = printable(first_line(error), _LONGEST_REASON)
             failed = f"onnxruntime {onnxruntime.__version__} failed while it ran {self._path}: {reason}"
             if _OUT_OF_MEMORY.search(reason):
-                failed += "; give the process more memory, or it fewer points at once"
+                failed += "; give it more memory, or fewer points at once"
             if self._provider != "cpu":
                 raise ProviderError(f"{failed}; provider cpu may run it") from error
             raise BundleError(f"{failed}; {_OTHER_VERSION}") from error

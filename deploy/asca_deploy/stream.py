@@ -189,7 +189,7 @@ class ScanQueue:
         if when_full not in get_args(WhenFull):
             raise ConfigError(f"when_full {when_full}: give {' or '.join(get_args(WhenFull))}")
         if size < 1:
-            raise ConfigError(f"size {size}: at least one scan has to wait somewhere")
+            raise ConfigError(f"size {size}: must be at least 1")
         self._drops, self._size = when_full == "drop", size
         self._waiting: deque[tuple[NDArray[Any], Any]] = deque()
         self._tags: dict[int, Any] = {}  # by the number of the scan; a scan without a tag leaves nothing to be kept

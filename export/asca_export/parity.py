@@ -116,15 +116,15 @@ def require_close(
     if not error <= allowed:
         raise _parity_error(
             scan,
-            f"PyTorch and onnxruntime part at stage {stage}: largest difference {error:.3g}, allowed {allowed:.3g}",
+            f"PyTorch and onnxruntime differ at stage {stage}: largest difference {error:.3g}, allowed {allowed:.3g}",
         )
     return error
 
 
 def _parity_error(scan: int, difference: str) -> ExportError:
     return ExportError(
-        f"scan {scan}: {difference}; nothing is written: try other versions of onnxruntime or torch, and if they say "
-        "the same, report it with the scan, the number of which counts from 0"
+        f"scan {scan}: {difference}; nothing is written: try other versions of onnxruntime or torch, and if the "
+        "difference remains, report it with the scan, whose number counts from 0"
     )
 
 

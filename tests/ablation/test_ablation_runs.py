@@ -66,9 +66,9 @@ LONG_CARS = (
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"seeds": "0,0"}, "--seeds 0,0: different whole numbers"),
-        ({"seeds": "-1"}, "--seeds -1: different whole numbers"),
-        ({"seeds": "zero"}, "--seeds zero: different whole numbers"),
+        ({"seeds": "0,0"}, "--seeds 0,0: give different whole numbers"),
+        ({"seeds": "-1"}, "--seeds -1: give different whole numbers"),
+        ({"seeds": "zero"}, "--seeds zero: give different whole numbers"),
         ({"variants": "asp_k9"}, "asp_k9: no such variant"),
         ({"variants": "baseline,baseline"}, "baseline is there twice"),
         ({"override": ["model.spec.grid.x_range_m=[0, 61.0]"]}, "x_range_m"),

@@ -80,7 +80,7 @@ def test_msaa_takes_the_place_of_the_points_alone_and_every_row_is_in_a_table() 
 
 
 def test_names_are_those_of_the_base_s_family() -> None:
-    with pytest.raises(ConfigError, match="--variants asp_k3: no such variant; there are pv_rcnn, deform_paper"):
+    with pytest.raises(ConfigError, match="--variants asp_k3: no such variant; available: pv_rcnn, deform_paper"):
         parse_variants("asp_k3", family_of(load_config(BASE)))
     with pytest.raises(
         ConfigError, match=r"model\.kind = pillar_refine: no variants; give a base of kind pillar or pv_rcnn"

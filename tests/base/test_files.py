@@ -127,7 +127,7 @@ def test_nothing_is_written_through_a_link_or_over_what_is_no_file(tmp_path: Pat
         (atomic_path(tmp_path / "file"), link),
         (atomic_directory(tmp_path / "folder", *EXPORT), link),
         (atomic_path(tmp_path), "is a folder"),
-        (atomic_path("/dev/null"), "no regular file"),
+        (atomic_path("/dev/null"), "not a regular file"),
     ):
         with pytest.raises(OutputError, match=message), writing:
             raise AssertionError("not reached")

@@ -338,7 +338,7 @@ def test_results_in_the_folder_of_a_bag_are_no_part_of_it(tmp_path: Path, work: 
 def test_damaged_messages_are_skipped_and_counted(drive: Path, tmp_path: Path) -> None:
     messages = zip(stamps(3), (laid_out(POINTS), b"torn", laid_out(POINTS)), strict=True)
     torn = write_mcap(tmp_path / "torn.mcap", {"/lidar": list(messages)})
-    with pytest.raises(ScanError, match=r"^1 scans were skipped: .*torn.mcap, /lidar, message 1: no readable"):
+    with pytest.raises(ScanError, match=r"^1 scans were skipped: .*torn.mcap, /lidar, message 1: not a readable"):
         run(torn, tmp_path / "out")
     assert [line["scan"] for line in read_lines(tmp_path / "out")] == ["torn.mcap/000000", "torn.mcap/000002"]
     assert not (tmp_path / "out" / JOURNAL_FILE).exists()
@@ -361,14 +361,14 @@ def test_what_does_not_fit_is_refused_before_anything_is_detected(drive: Path, t
         ({"columns": 7}, ConfigError, "--columns 7: is for"),
         ({"foxglove": Path("boxes.json")}, ConfigError, "choose such a name"),
         ({"track": True, "score": ["1.2"]}, ConfigError, r"score_threshold 1\.2 of class Car must lie"),
-        ({"foxglove": drive}, OutputError, r"would replace .*drive\.mcap, which is read"),
+        ({"foxglove": drive}, OutputError, r"would replace the input .*drive\.mcap"),
         ({"foxglove": other}, OutputError, r"other\.mcap: .*did not write it"),
         ({"out": tmp_path}, OutputError, r"other\.mcap"),
     ]
     for options, kind, message in cases:
         with pytest.raises(kind, match=message):
             run(drive, options.pop("out", tmp_path / "out"), **options)
-    with pytest.raises(ConfigError, match="give one alone"):
+    with pytest.raises(ConfigError, match="must be the only input"):
         detect([drive, sample_scan_path()], out=tmp_path / "out")
     with pytest.raises(ConfigError, match="need a recording"):
         run(sample_scan_path(), tmp_path / "out", topic="/lidar")

@@ -181,8 +181,8 @@ def test_a_model_of_other_classes_alone_is_refused_before_it_runs(tmp_path: Path
             "--compare det belongs to the gallery of --protocol",
         ),
         ("{texts} --score nan", "--score nan must be a number"),
-        ("{texts} --json {root}", "kitti: is a folder; choose a file's name"),
-        ("{texts} --json {root} --protocol waymo", "kitti: is a folder; choose a file's name"),
+        ("{texts} --json {root}", "kitti: is a folder; choose the name of a file"),
+        ("{texts} --json {root} --protocol waymo", "kitti: is a folder; choose the name of a file"),
         (
             "{texts} --protocol waymo --score 0.5",
             "--score 0.5 belongs to --protocol kitti; Waymo's metric goes over all scores: leave it out",

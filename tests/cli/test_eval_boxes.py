@@ -178,7 +178,7 @@ def test_frames_without_predictions_are_named_and_classes_have_something_in_comm
         ("--data {root} --labels x", "--labels x belongs to"),
         ("--data {root} --min-score 0.9", "of Car is below --min-score 0.9"),
         ("--data {root} --score 0.01", "score 0.01 of Car is below --min-score 0.05"),
-        ("--data {root} --score 5", "--score 5: no detection of a model has such a score"),
+        ("--data {root} --score 5", "--score 5: scores of a model are at most 1"),
         ("--data {root} --predictions x --provider y", "--provider y is for running a model"),
         ("--data {root} --predictions x --precision y", "--precision y is for running a model"),
         ("--data {root} --predictions x --min-score 0.9", "--min-score 0.9 is for running a model"),

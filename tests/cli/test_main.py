@@ -154,7 +154,7 @@ def test_from_training_to_boxes(tmp_path: Path) -> None:
         write_scan(scans / f"{seed}.bin", make_scene(seed)[0])
     export = ("export", run / "checkpoints" / "last.ckpt", "-o", bundle, "--scans", scans)
 
-    assert "Pedestrain: no such class; there are" in refusal(run_here(*export, "--score", "Pedestrain=0.2"))
+    assert "Pedestrain: no such class; available:" in refusal(run_here(*export, "--score", "Pedestrain=0.2"))
     exported = run_here(*export, "--score", "Pedestrian=0.21", "--with-weights")
     assert exported.returncode == 0, exported.stderr
     assert (bundle / "weights.ckpt").read_bytes() == (run / "checkpoints" / "weights.ckpt").read_bytes()

@@ -57,7 +57,7 @@ def test_every_kind_of_error_has_its_exit_code() -> None:
     ("error", "line", "code"),
     [
         (errors.ScanError("a.pcd: TYPE \x1b[2J\n"), r"a.pcd: TYPE \x1b[2J\n", 4),
-        (MemoryError("Unable to allocate 46.6 GiB"), "not enough memory (Unable to allocate 46.6 GiB); ", 5),
+        (MemoryError("Unable to allocate 46.6 GiB"), "out of memory (Unable to allocate 46.6 GiB); ", 5),
         (RecursionError("deep"), "the input is nested too deeply", 4),
         (OSError(28, "No space left on device", "a.ckpt"), "a.ckpt: No space left on device", 5),
     ],

@@ -157,7 +157,7 @@ def test_the_others_keep_their_own() -> None:
     assert scores_by_class(None, own) == own
     assert scores_by_class(0.2, own) == {"Car": 0.2, "Cyclist": 0.2}
     assert scores_by_class({"Car": 0.1}, own) == {"Car": 0.1, "Cyclist": 0.3}
-    with pytest.raises(ConfigError, match="--score Van: no such class; there are Car, Cyclist"):
+    with pytest.raises(ConfigError, match="--score Van: no such class; available: Car, Cyclist"):
         scores_by_class({"Van": 0.1}, own)
 
 
@@ -176,7 +176,7 @@ def test_detect_and_the_detector_agree(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("score", "message"),
     [
-        ("Lorry=0.4", "Lorry: no such class; there are Car, Pedestrian, Cyclist"),
+        ("Lorry=0.4", "Lorry: no such class; available: Car, Pedestrian, Cyclist"),
         ("Car=1.5", "score_threshold 1.5 of class Car must lie between 0 and 1"),
         ("Car:0.4", "such as Car=0.35"),
     ],

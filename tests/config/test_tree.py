@@ -205,7 +205,7 @@ CAR = "length_m: 9, width_m: 2.5, height_m: 3.2, z_m: -0.2, positive_iou: 0.6, n
     [
         (
             "augment: {insert: {proportions: {Lorry: 1}}}",
-            "augment.insert.proportions.Lorry: no such class; there are Car, Pedestrian, Cyclist",
+            "augment.insert.proportions.Lorry: no such class; available: Car, Pedestrian, Cyclist",
         ),
         (
             "augment: {insert: {proportions: {Car: 0}}}",

@@ -154,7 +154,7 @@ def test_the_fastest_that_agrees_is_taken() -> None:
     found = outcomes(choice)
     assert found["cpu_float32"] == found["cuda_float32"] == found["openvino_reduced"] == auto.AGREES
     assert "misses a Pedestrian" in found["cuda_reduced"]
-    assert "ask for it by name" in found["tensorrt_reduced"] and ("tensorrt", "reduced") not in machine.opened
+    assert "request it by name" in found["tensorrt_reduced"] and ("tensorrt", "reduced") not in machine.opened
     assert found["openvino_float32"] == "does not run: no AVX"
     line = auto.summary(f"{choice.provider} {choice.precision}", choice.candidates)
     assert line.startswith("auto takes cuda float32: cpu float32 70.0 ms agrees; ") and "\n" not in line
@@ -175,7 +175,7 @@ CPU_S = 0.02
         (
             {"cpu_float32": (FOUND, 0.7), "openvino_reduced": (FOUND, 0.6), "openvino_float32": (FOUND, 0.001)},
             ("openvino", "reduced"),
-            "not tried, 2 s were over: ask for it by name",
+            "not tried, the 2 s for trials were over: request it by name",
         ),
     ],
 )

@@ -278,7 +278,7 @@ def test_what_is_read_and_what_others_wrote_is_not_replaced(made_up_package: Pat
     write_page(page, bundle, sample_scan_path(), made_up_package)
     before = {path.name: path.read_bytes() for path in page.iterdir()}
     for read in ((page, sample_scan_path()), (bundle, page / "sample.bin")):
-        with pytest.raises(OutputError, match=r"would replace .*, which is read"):
+        with pytest.raises(OutputError, match=r"would replace the input "):
             write_page(page, *read, made_up_package)
     (page / "page.json").write_text('{"files": ["index.html"]}')
     with pytest.raises(OutputError, match=r"page\.json: `asca export --browser` did not write it"):

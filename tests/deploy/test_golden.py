@@ -84,8 +84,8 @@ def test_written_again_and_only_over_itself(tiny_bundle: Path, scan_path: Path, 
         (["--golden", "--int8"], "--int8 is for a checkpoint"),
         (["--golden", "--with-weights"], "--with-weights is for a checkpoint"),
         (["--golden", "--score", "Car=0.3"], "--score is for a checkpoint"),
-        (["--golden", "--browser"], "one of --golden and --browser"),
-        (["--ort-web", "x.tgz"], "--ort-web goes with --browser"),
+        (["--golden", "--browser"], "either --golden or --browser"),
+        (["--ort-web", "x.tgz"], "--ort-web is for --browser"),
     ],
 )
 def test_options_that_do_not_go_together(tiny_bundle: Path, tmp_path: Path, options: list[str], message: str) -> None:

@@ -51,7 +51,7 @@ FAILURES = pytest.mark.parametrize(
     ("graph", "spoil", "message"),
     [
         ("encoder.onnx", read_beyond_the_end, "upgrade with `pip install --upgrade onnxruntime`, or export the bundle"),
-        ("backbone.onnx", take_all_memory, "give the process more memory, or it fewer points at once"),
+        ("backbone.onnx", take_all_memory, "give it more memory, or fewer points at once"),
     ],
 )
 

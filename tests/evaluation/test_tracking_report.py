@@ -231,7 +231,7 @@ def test_what_cannot_be_scored_or_written_is_refused(drives: Path, tmp_path: Pat
     with pytest.raises(ConfigError, match="give --data"):
         CliRunner().invoke(app, ["eval", "--protocol", "tracking"], catch_exceptions=False)
     lines = labels(drives)
-    with pytest.raises(DatasetError, match=r"jsonl:7: frame .* has predictions in .*jsonl:1; join them"):
+    with pytest.raises(DatasetError, match=r"jsonl:7: frame .* has predictions in .*jsonl:1; merge them"):
         score(drives, tmp_path, [*lines, lines[0]])
     with pytest.raises(OutputError, match="is a folder"):
         options: dict[str, Any] = {"split": "training", "protocol": "tracking", "json": tmp_path}

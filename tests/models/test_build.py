@@ -64,8 +64,8 @@ def test_what_is_none_of_ours_is_named(tmp_path: Path, capfd: pytest.CaptureFixt
     for content, message in (
         ({name: value for name, value in whole.items() if name != "global_step"}, f"{ours} .*no 'global_step'"),
         (whole | {"global_step": None}, f"{ours} .*int"),
-        ({"model_state": state}, "a checkpoint of OpenPCDet; `asca import-weights` makes one of ours"),
-        ({"meta": {}, "state_dict": state}, "a checkpoint of mmdetection3d; `asca import-weights`"),
+        ({"model_state": state}, "a checkpoint of OpenPCDet; convert it with `asca import-weights`"),
+        ({"meta": {}, "state_dict": state}, "a checkpoint of mmdetection3d; convert it with `asca import-weights`"),
         (state, "no 'hyper_parameters'"),
         (torch.zeros(3), "it holds a Tensor, where a checkpoint holds a dictionary"),
         (None, "it holds a NoneType"),

@@ -163,7 +163,7 @@ def test_a_right_scan_all_around(angle_deg: float) -> None:
 
 @pytest.mark.parametrize("axes", ["y-forward", "x,-y,-z"])
 @pytest.mark.parametrize("scan", [revolution(1), read_scan(sample_scan_path()).points], ids=["street", "sample"])
-def test_other_axes_are_noticed_and_the_remedy_mends_them(scan: Points, axes: str) -> None:
+def test_other_axes_are_noticed_and_the_remedy_corrects_them(scan: Points, axes: str) -> None:
     wrong = Mounting(axes=axes).level.inverse.points(scan)
     (warning,) = check(wrong)
     remedy = warning.text.split("(--axes ")[1].split(")")[0]

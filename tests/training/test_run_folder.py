@@ -208,7 +208,7 @@ def test_nothing_is_trained_through_links_or_over_the_weights_to_start_from(tmp_
     last = run / "checkpoints" / "last.ckpt"
     require_own_run(run, "asca_sim")
     require_own_run(tmp_path / "other", last)
-    with pytest.raises(OutputError, match=r"would replace .*last\.ckpt, which is read"):
+    with pytest.raises(OutputError, match=r"would replace the input .*last\.ckpt"):
         require_own_run(run, last)
     (run / "tensorboard").mkdir()
     for name in ("checkpoints", "tensorboard", "config.yaml"):

@@ -216,7 +216,7 @@ def _cells(reader: Any, path: Path) -> Iterator[list[str]]:
     try:
         yield from reader
     except csv.Error as error:
-        raise DatasetError(f"{path}:{reader.line_num}: no CSV ({error}); close the quotes") from None
+        raise DatasetError(f"{path}:{reader.line_num}: not valid CSV ({error}); close the quotes") from None
 
 
 def _records(placed: Iterable[tuple[str, Any]]) -> BoxRecords:
@@ -261,7 +261,7 @@ def _number(value: Any, name: str, place: str) -> float:
     except (TypeError, ValueError, OverflowError):
         number = math.nan
     if not abs(number) < _TOO_LARGE:
-        raise DatasetError(f"{place}: {name} is {str(value)[:40]!r}, no usable number; correct or remove the box")
+        raise DatasetError(f"{place}: {name} is {str(value)[:40]!r}, not a usable number; correct or remove the box")
     return number
 
 

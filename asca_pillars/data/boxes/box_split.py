@@ -89,10 +89,10 @@ def find_frames(labels: Path, scans: Path) -> dict[str, BoxFrame]:
             )
         frame_id = frame_id_of(scan_path, scans)
         if frame_id in places:
-            raise DatasetError(f"{place}: {scan} has labels in {places[frame_id]} already; join them")
+            raise DatasetError(f"{place}: {scan} has labels in {places[frame_id]} already; merge them")
         frames[frame_id], places[frame_id] = BoxFrame(scan_path, labels, records, time_s), place
     if not frames:
-        raise DatasetError(f"{labels}: no frame in it; write a line for each scan, as docs/DATA.md says")
+        raise DatasetError(f"{labels}: contains no frame; write a line for each scan, as docs/DATA.md says")
     return frames
 
 

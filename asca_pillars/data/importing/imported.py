@@ -61,7 +61,7 @@ def text_of(value: Any, name: str) -> str:
     """
     text = " ".join(value.split()) if isinstance(value, str) and len(value) <= _LONGEST_TEXT else ""
     if not text or not text.isprintable():
-        raise ValueError(f"{name} is {_QUOTE.repr(value)}, no name")
+        raise ValueError(f"{name} is {_QUOTE.repr(value)}, not a name")
     return text
 
 
@@ -215,7 +215,7 @@ def rename_types(imported: Imported, names: Mapping[str, str]) -> Imported:
     types = {kind for frame in imported.frames for kind in frame.records.types}
     if unknown := sorted(set(names) - types):
         raise ConfigError(
-            f"--rename {unknown[0]}: no box has that class; there are {', '.join(sorted(types)) or 'none'}"
+            f"--rename {unknown[0]}: no box has that class; the labels have {', '.join(sorted(types)) or 'none'}"
         )
     frames = [
         frame._replace(

@@ -72,7 +72,7 @@ def _read_tracklets(path: Path, left_out: SkippedEntries) -> dict[int, _Labels]:
     except OSError as error:
         raise DatasetError(f"{path}: cannot be read ({error.strerror}); correct the path") from None
     except (ElementTree.ParseError, ValueError) as error:
-        raise DatasetError(f"{path}: no tracklets of KITTI ({error}); download the file again") from None
+        raise DatasetError(f"{path}: not a KITTI tracklet file ({error}); download the file again") from None
     for number, tracklet in enumerate(tracklets):
         try:
             _add(labels, number, tracklet, left_out, path)

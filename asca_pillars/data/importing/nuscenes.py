@@ -101,7 +101,7 @@ def _frames(
             if scan is None:
                 if isinstance(filename, str) and ".." not in Path(filename).parts and not Path(filename).is_absolute():
                     continue  # only a part of the dataset may have been downloaded
-                raise ValueError(f"filename is {str(filename)[:80]!r}, no file below {data}")
+                raise ValueError(f"filename is {str(filename)[:80]!r}, not a file below {data}")
             changes = [_change(frame) for frame in (_linked(row, "ego_pose", tables), sensor)]
             annotations = labels.get(row["sample_token"], [])
             frames.append(ImportedFrame(scan, _records(annotations, changes, tables, folder, left_out), scene))
@@ -140,7 +140,7 @@ def _change(row: _Row) -> tuple[_Doubles, _Doubles]:
     """Return the rotation (3, 3) and translation (3,), metres, of a row, to its parent frame."""
     turn = rotations_from_quaternions(numbers(entry(row, "rotation"), 4, "rotation"))
     if not np.isfinite(turn).all():
-        raise ValueError(f"rotation is {row['rotation']}, no quaternion")
+        raise ValueError(f"rotation is {row['rotation']}, not a quaternion")
     return turn, numbers(entry(row, "translation"), 3, "translation")
 
 
@@ -162,7 +162,7 @@ def _tables_folder(root: Path) -> Path:
     folders = sorted(path.parent for path in root.glob("v1.0-*/sample_data.json"))
     if len(folders) != 1:
         names = ", ".join(path.name for path in folders) or "none"
-        raise DatasetError(f"{root}: one v1.0-*/ with nuScenes' tables is needed, there is {names}; give its path")
+        raise DatasetError(f"{root}: one v1.0-*/ with nuScenes' tables is needed, found {names}; give its path")
     return folders[0]
 
 
@@ -176,7 +176,7 @@ def _table(folder: Path, name: str, left_out: SkippedEntries) -> _Table:
     except (ValueError, RecursionError):
         rows = None
     if not isinstance(rows, list):
-        raise DatasetError(f"{path}: no table of nuScenes, a list of rows with a token; download it again")
+        raise DatasetError(f"{path}: not a nuScenes table (a list of rows with a token); download it again")
     table = {}
     for number, row in enumerate(rows):
         try:

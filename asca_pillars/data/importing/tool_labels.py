@@ -208,7 +208,7 @@ def require_unchanged(out: Path, name: str) -> None:
         OutputError: names the file.
     """
     if name not in TOOLS:
-        raise ConfigError(f"--write {name}: no such format; there are {', '.join(TOOLS)}")
+        raise ConfigError(f"--write {name}: no such format; available: {', '.join(TOOLS)}")
     folder = out / name
     require_no_link(out, name)
     require_own_file(out / WRITTEN_FILE, COMMAND, json_object())

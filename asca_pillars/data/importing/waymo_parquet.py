@@ -341,7 +341,7 @@ def _parquet_rows(path: Path, columns: Sequence[str]) -> Iterator[dict[str, Any]
                     yield {name: _plain(batch.column(name)[row]) for name in columns}
     except (pyarrow.ArrowException, OSError, KeyError) as reason:  # KeyError: two columns of one name
         text = " ".join(str(reason).split())[:100]
-        raise DatasetError(f"{path}: no readable parquet file ({text}); copy it again") from None
+        raise DatasetError(f"{path}: not a readable parquet file ({text}); copy it again") from None
 
 
 def _plain(value: Any) -> Any:

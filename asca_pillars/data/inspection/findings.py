@@ -437,7 +437,7 @@ def propose_config(
         OutputError: there is a file already.
     """
     if path.exists():
-        raise OutputError(f"{path}: is there already and may have been edited; choose another name, or remove it")
+        raise OutputError(f"{path}: already exists and may have been edited; choose another name, or remove it")
     proposal = propose(split, config, frames=frames, reporter=reporter)
     boxes = ", ".join(f"{name} {count}" for name, count in proposal.boxes.items())
     notes = [f"Measured on {split.root}, {split.name}: {boxes} boxes."]

@@ -94,7 +94,7 @@ def boxes_from_objects(objects: Sequence[KittiObject], calib: Calibration) -> ND
         ValueError: an object has no 3D box; filter the list with `objects_3d` first.
     """
     if not all(item.has_box_3d for item in objects):
-        raise ValueError("objects without a 3D box have no place here: filter with objects_3d() first")
+        raise ValueError("objects without a 3D box are not allowed here: filter with objects_3d() first")
     fields = [(o.x_m, o.y_m - o.height_m / 2, o.z_m, o.length_m, o.width_m, o.height_m, o.rotation_y) for o in objects]
     boxes = np.array(fields, dtype=np.float64).reshape(-1, 7)
     heading_rect = np.stack([np.cos(boxes[:, 6]), -np.sin(boxes[:, 6])], axis=1)

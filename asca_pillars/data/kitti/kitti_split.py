@@ -138,7 +138,7 @@ class KittiSplit:
             raise DatasetError(f"{path}: cannot be read ({error.strerror}); replace or remove it") from None
         if len(start) < 24 or not start.startswith(_PNG) or min(size := struct.unpack(">2I", start[16:])) == 0:
             raise DatasetError(
-                f"{path}: no PNG, or a damaged one; replace it, or remove it: without images KITTI's size is taken"
+                f"{path}: not a PNG, or damaged; replace it, or remove it: without images KITTI's size is taken"
             )
         return size[0], size[1]
 

@@ -44,7 +44,7 @@ def predictions_by_frame(path: Path, split: LabeledSplit) -> dict[str, NamedReco
         frame_id = _frame_of_line(line, known, timed_ids, stamps_s)
         if frame_id in predictions:
             raise DatasetError(
-                f"{line.place}: frame {frame_id} has predictions in {predictions[frame_id].place}; join them"
+                f"{line.place}: frame {frame_id} has predictions in {predictions[frame_id].place}; merge them"
             )
         if frame_id is not None:
             predictions[frame_id] = line

@@ -215,7 +215,7 @@ def read_report(path: Path) -> ErrorReport:
     except ValueError:
         content = None
     if not isinstance(content, dict):
-        raise DatasetError(f"{path}: no errors.json of asca eval --errors; give one")
+        raise DatasetError(f"{path}: not an errors.json of asca eval --errors; give one")
     return parse(ErrorReport, content, str(path))
 
 

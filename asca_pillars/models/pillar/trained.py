@@ -120,17 +120,17 @@ class Distillation:
     def __init__(self, config: Config, teacher: str) -> None:
         model = config.model
         if not isinstance(model, PillarModel):
-            raise ConfigError(f"train.teacher = {teacher}: only model.kind pillar learns from one; leave it out")
+            raise ConfigError(f"train.teacher = {teacher}: only model.kind pillar supports a teacher; leave it out")
         self._network, spec, _ = load_trained_pillars(teacher, "train.teacher")
         self._loss, self._weight = model.loss, config.train.teacher_weight
         student, teaching = model.network, self._network.preparation
         if _anchors(spec) != _anchors(model.spec):
             raise ConfigError(
-                f"train.teacher = {teacher}: its model.spec is another; give both the same grid, limits and classes"
+                f"train.teacher = {teacher}: its model.spec differs; give both the same grid, limits and classes"
             )
         if teaching.active_cells != (student.active_cells if student.neck == "sparse" else None):
             raise ConfigError(
-                f"train.teacher = {teacher}: its neck is another; give both the same model.network.neck and "
+                f"train.teacher = {teacher}: its neck differs; give both the same model.network.neck and "
                 "model.network.active_cells"
             )
 

@@ -169,7 +169,9 @@ class McapRecording(Recording):
                     counts[record.channel_id] += 1
         except Exception as error:
             if not self._known.channels and not self._unread:
-                raise ScanError(f"{self.path}: no readable MCAP ({reason(error)}); copy or record it again") from None
+                raise ScanError(
+                    f"{self.path}: not a readable MCAP ({reason(error)}); copy or record it again"
+                ) from None
             self.damage = f"{self.path}: ends early ({reason(error)})"
         return counts
 

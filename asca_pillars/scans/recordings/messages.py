@@ -44,7 +44,7 @@ def decompress_file(source: Path, reporter: Reporter = SILENT) -> Path:
                 f"{source}: cannot be unpacked to {folder.parent} ({error.strerror}); set TMPDIR to a folder with room"
             ) from None
         raise ScanError(
-            f"{source}: no readable {source.suffix} file ({reason(error)}); copy or record it again"
+            f"{source}: not a readable {source.suffix} file ({reason(error)}); copy or record it again"
         ) from None
     return folder / source.stem
 

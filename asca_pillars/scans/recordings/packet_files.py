@@ -70,7 +70,7 @@ class PacketCapture(Recording):
             try:
                 reader: Any = dpkt.pcap.UniversalReader(stream)
             except (ValueError, dpkt.UnpackError) as error:
-                raise ScanError(f"{self.path}: no readable pcap ({reason(error)}); capture it again") from None
+                raise ScanError(f"{self.path}: not a readable pcap ({reason(error)}); capture it again") from None
             link = dpkt.sll.SLL if reader.datalink() == dpkt.pcap.DLT_LINUX_SLL else dpkt.ethernet.Ethernet
             for time_s, content in reader:
                 try:
@@ -86,7 +86,7 @@ class PacketCapture(Recording):
         except ScanError:
             raise
         except Exception as error:
-            raise ScanError(f"{self.path}: no readable pcap ({reason(error)}); capture it again") from None
+            raise ScanError(f"{self.path}: not a readable pcap ({reason(error)}); capture it again") from None
 
     def _velodyne(self) -> Iterator[tuple[int, NDArray[np.float32]]]:
         import velodyne_decoder
@@ -147,7 +147,7 @@ class OusterPackets:
             self._info: Any = core.SensorInfo(decode_message(message, "std_msgs/msg/String").data)
             self._format: Any = core.PacketFormat(self._info)
         except Exception as error:  # the libraries have errors of their own
-            raise ScanError(f"{place}: no readable metadata of an Ouster ({reason(error)}); record it again") from None
+            raise ScanError(f"{place}: unreadable metadata of the Ouster ({reason(error)}); record it again") from None
         packets = self._info.format.columns_per_frame / self._info.format.columns_per_packet
         self.revolutions = math.ceil(topic.messages / packets)
 

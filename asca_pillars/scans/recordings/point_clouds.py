@@ -251,7 +251,7 @@ def read_point_cloud(message: Message, source: str, kind: ScanKind = "PointCloud
         raise
     except Exception as error:  # the library does not catch struct's and NumPy's errors
         name = kind if kind.startswith("Point") else f"point cloud of {kind}"
-        raise ScanError(f"{source}: no readable {name} ({reason(error)}); record it again") from None
+        raise ScanError(f"{source}: not a readable {name} ({reason(error)}); record it again") from None
     time_ns = time_of(header, message)
     if time_ns is None:
         note = "neither the header nor the recording has a usable time stamp, it was taken as 0"

@@ -55,8 +55,8 @@ class SqliteRecording(Recording):
                 self._read_topics(database)
         except Exception as error:  # SQLite's own, and UnicodeDecodeError of its messages about damage
             raise ScanError(
-                f"{path}: no readable rosbag2 ({reason(error)}); copy it again, or mend it "
-                "(sqlite3 broken.db3 .recover | sqlite3 mended.db3)"
+                f"{path}: not a readable rosbag2 ({reason(error)}); copy it again, or repair it "
+                "(sqlite3 broken.db3 .recover | sqlite3 repaired.db3)"
             ) from None
 
     def messages(self, topic: str) -> Iterator[Message]:
@@ -244,7 +244,7 @@ class RosBag(Recording):
             reader.open()
         except Exception as error:
             raise ScanError(
-                f"{self.path}: no readable ROS 1 bag ({reason(error)}); copy it again, or mend its index "
+                f"{self.path}: not a readable ROS 1 bag ({reason(error)}); copy it again, or repair its index "
                 "(rosbag reindex)"
             ) from None
         reader.chunks = {place: chunk._replace(decompressor=_bounded(chunk)) for place, chunk in reader.chunks.items()}

@@ -20,7 +20,7 @@ export function readScan(name, buffer) {
   if (!Object.hasOwn(readers, suffix)) throw new Error(`${name}: scans are .bin, .npy, .pcd and .ply files`);
   if (buffer.byteLength === 0) throw new Error(`${name}: the file is empty`);
   if (buffer.byteLength <= 1024 && LFS_POINTER.test(text(new Uint8Array(buffer)))) {
-    throw new Error(`${name}: is a pointer of Git LFS, its content was not fetched; run git lfs pull`);
+    throw new Error(`${name}: is a Git LFS pointer whose content was not fetched; run git lfs pull`);
   }
   try {
     return usable(readers[suffix](buffer));

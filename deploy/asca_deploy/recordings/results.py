@@ -130,7 +130,7 @@ class Journal:
         for line in self._lines([self._starts[number] for number in sorted(self._starts)]):
             text = verify_checksum(line, self._about)
             if text is None:
-                raise OutputError(f"{self.path}: was changed while it was written; give the same command again")
+                raise OutputError(f"{self.path}: was changed while it was written; run the same command again")
             yield self._result(json.loads(text))
 
     def remove(self) -> None:

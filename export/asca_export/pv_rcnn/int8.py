@@ -38,7 +38,7 @@ def require_quantizable(model: PvRcnnModel) -> None:
     """
     if model.network.attention != "none":
         raise ExportError(
-            f"model.network.attention {model.network.attention}: a backbone with attention is not put in 8 bits; "
+            f"model.network.attention {model.network.attention}: a backbone with attention cannot be quantized; "
             "leave --int8 out"
         )
 

@@ -151,7 +151,7 @@ def export_refine_bundle(
         bundle = write_bundle(folder, draft, compare, options.weights)
         if calibration is None:
             return bundle
-        options.progress("Putting the first stage in 8 bits")
+        options.progress("Quantizing the first stage")
         quantized = dataclasses.replace(in_float, calibration=calibration)
         eight_bit = _first_bundle(model.first_stage, Path(temporary) / "int8", scans, quantized)
         return _to_int8(folder, bundle, first, eight_bit, scans, calibration)

@@ -109,7 +109,7 @@ def with_box(**changes: object) -> str:
         ("l.jsonl", with_box(x_m=True), r"box 1: x_m is 'True'"),
         ("l.jsonl", with_box(x_m=10**400), r"box 1: x_m is '1000"),
         ("l.jsonl", with_box(score=-(10**400)), r"box 1: score is '-1000"),
-        ("l.jsonl", with_box(yaw_rad=235), r"yaw_rad is 235, .* radians .* pi / 180"),
+        ("l.jsonl", with_box(yaw_rad=235), r"yaw_rad is 235, .* radians; .* pi / 180"),
         ("l.jsonl", with_box(width_m=0), r"box 1: width_m is 0"),
         ("l.jsonl", with_box(**{"class": " "}), r"box 1: no `class`"),
         ("l.jsonl", '{"scan": "a", "boxes": [{"class": "Car", "x": 1}]}', r"box 1: no `y_m`"),
@@ -118,7 +118,7 @@ def with_box(**changes: object) -> str:
         ("l.csv", "scan,class\na,Car,1\n", r"l\.csv:2: 3 values for 2 columns"),
         ("l.csv", "scan,class,class\na,Car,1\n", r"l\.csv:1: the column `class` is there twice"),
         ("l.csv", "scan;class;x\na;Car;1\n", r"l\.csv:1: columns are separated by semicolons"),
-        ("l.csv", 'scan,class\n"' + 200_000 * "a", r"l\.csv:2: no CSV \(.*\); close the quotes"),
+        ("l.csv", 'scan,class\n"' + 200_000 * "a", r"l\.csv:2: not valid CSV \(.*\); close the quotes"),
         ("l.csv", "scan,class,x,x_m\na,Car,1,9\n", r"l\.csv:2: both `x` and `x_m`; remove one"),
         ("l.txt", "", r"l\.txt: labels of several frames are \.jsonl or \.csv"),
     ],
@@ -160,7 +160,7 @@ def test_right_yaws_are_not(yaws: list[float]) -> None:
 @pytest.mark.parametrize("yaw", ["90", "-90", "6.5", "235"])
 def test_rotation_y_in_degrees_is_refused(yaw: str, tmp_path: Path) -> None:
     (tmp_path / "a.txt").write_text(f"{CAR.format(yaw='1.57')}\n{CAR.format(yaw=yaw)}\n")
-    with pytest.raises(DatasetError, match=rf"a\.txt:2: rotation_y is {yaw}, .* radians .* pi / 180"):
+    with pytest.raises(DatasetError, match=rf"a\.txt:2: rotation_y is {yaw}, .* radians; .* pi / 180"):
         read_labels(tmp_path / "a.txt")
 
 
@@ -198,6 +198,6 @@ def test_import_and_eval_of_boxes_name_whole_yaws(tmp_path: Path) -> None:
             box |= {"yaw_rad": number + 4, "score": 0.5}
     boxes.write_text("".join(json.dumps(line) + "\n" for line in lines))
     output = invoke("import", boxes, tmp_path / "out", "--scans", own / "scans")
-    assert "all 6 yaws that are not 0 are whole numbers, such as 5: radians are wanted" in output
+    assert "all 6 yaws that are not 0 are whole numbers, such as 5: yaws must be in radians" in output
     output = invoke("eval", "--data", own, "--split", "training", "--predictions", boxes, "-o", tmp_path / "scores")
     assert "predictions: all 6 yaws" in output and "labels: all" not in output

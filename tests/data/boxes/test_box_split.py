@@ -200,7 +200,7 @@ def test_scans_may_lie_anywhere_and_in_folders(root: Path, tmp_path: Path) -> No
         ('{"scan": "../000000.bin", "boxes": []}', r"labels\.jsonl:1: no scan"),
         (f'{{"scan": "{"a/" * 200_000}x.bin", "boxes": []}}', r"labels\.jsonl:1: no scan"),
         ('{"scan": "000000.bin", "boxes": []}\n' * 2, r"labels\.jsonl:2: 000000\.bin has labels in .*jsonl:1 already"),
-        ("", r"labels\.jsonl: no frame in it"),
+        ("", r"labels\.jsonl: contains no frame"),
         ('{"scan": "000000.bin", "boxes": []}', r"000001: listed in ImageSets/train\.txt, but .* has no such frame"),
     ],
     ids=range(6),

@@ -135,7 +135,7 @@ def test_a_table_names_no_file_outside_its_dataset(name: str, tmp_path: Path) ->
     change_rows(source, "sample_data", lambda rows: rows.append(rows[0] | evil))
     imported = drop_unwritable(read_nuscenes(source))
     assert len(imported.frames) == 1 and imported.left_out.counts["frames"] == 1
-    assert "no file below" in imported.left_out.lines()[0]
+    assert "not a file below" in imported.left_out.lines()[0]
 
 
 @pytest.mark.parametrize(
@@ -146,9 +146,9 @@ def test_a_table_names_no_file_outside_its_dataset(name: str, tmp_path: Path) ->
         ("sample_annotation", "translation", [1e300, 0, 0], "boxes: 1, .*not 3 finite"),
         ("sample_annotation", "rotation", ["1", "0", "0", "0"], "boxes: 1, .*not 4 finite"),
         ("sample_annotation", "instance_token", {"token": "i"}, "boxes: 1, .*instance.json has no"),
-        ("sample_annotation", "sample_token", 7, "boxes: 1, .*sample_token is 7, no name"),
+        ("sample_annotation", "sample_token", 7, "boxes: 1, .*sample_token is 7, not a name"),
         ("instance", "category_token", ["k"], "boxes: 1, .*category.json has no"),
-        ("category", "name", "\n", "boxes: 1, .*no name"),
+        ("category", "name", "\n", "boxes: 1, .*not a name"),
         ("ego_pose", "rotation", [0, 0, 0, 0], r"frames: 1, .*rotation is \[0, 0, 0, 0\]"),
         ("ego_pose", "translation", None, r"frames: 1, .*sample_data\.json, x: translation is None"),
         ("calibrated_sensor", "translation", [0, 0], r"frames: 1, .*translation is \[0, 0\], not 3 finite numbers"),

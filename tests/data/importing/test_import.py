@@ -53,7 +53,7 @@ def test_an_import_is_not_imported_over_itself(tmp_path: Path) -> None:
     (tmp_path / "link.jsonl").symlink_to(labels)
     before = labels.read_bytes()
     for source in (labels, tmp_path / "link.jsonl"):
-        with pytest.raises(OutputError, match=r"labels\.jsonl: would replace .*, which is read"):
+        with pytest.raises(OutputError, match=r"labels\.jsonl: would replace the input "):
             invoke("import", source, *rest, "--rename", "Car=Van")
     assert labels.read_bytes() == before
     labels.write_text("my notes on labels\n")
@@ -82,8 +82,8 @@ def test_classes_by_other_names(tmp_path: Path) -> None:
     source = (own / "labels.jsonl", tmp_path / "out", "--scans", own / "scans")
     assert "boxes: Truck 8" in invoke("import", *source, "--rename", "Forklift=Truck", "--rename", "Car=Truck")
     assert "Big one 4" in invoke("import", *source, "--rename", "Car= Big\n one", "--rename", "Forklift=Truck")
-    wrong = ("Bus=Truck", "no box has that class; there are Car, Forklift"), ("Car", "write OLD=NEW")
-    for text, message in (*wrong, ("Car= ", "the new name is ' ', no name")):
+    wrong = ("Bus=Truck", "no box has that class; the labels have Car, Forklift"), ("Car", "write OLD=NEW")
+    for text, message in (*wrong, ("Car= ", "the new name is ' ', not a name")):
         with pytest.raises(ConfigError, match=message):
             invoke("import", *source, "--rename", text)
 
@@ -144,7 +144,7 @@ def test_argoverse2_mistakes_are_named(tmp_path: Path) -> None:
     for columns, message in (
         ({name: ["?"] if name == "y" else [1.0] for name in ("x", "y", "z", "intensity")}, "column `y` is not what"),
         ({"x": [1.0]}, r"no column `y` \(there are: x\)"),
-        (None, "no readable feather file"),
+        (None, "not a readable feather file"),
     ):
         sweep.write_bytes(b"no feather") if columns is None else feather.write_feather(table(columns), sweep)
         with pytest.raises(ScanError, match=rf"2\.feather: {message}"):
@@ -171,10 +171,10 @@ def test_nuscenes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 def test_nuscenes_mistakes_are_named(tmp_path: Path) -> None:
     source = write_nuscenes(tmp_path / "nuscenes")
     table = source / "v1.0-mini" / "scene.json"
-    with pytest.raises(DatasetError, match=r"one v1\.0-\*/ with nuScenes' tables is needed, there is none"):
+    with pytest.raises(DatasetError, match=r"one v1\.0-\*/ with nuScenes' tables is needed, found none"):
         read_nuscenes(tmp_path)
     table.write_text("7")
-    with pytest.raises(DatasetError, match=r"scene\.json: no table of nuScenes"):
+    with pytest.raises(DatasetError, match=r"scene\.json: not a nuScenes table"):
         read_nuscenes(source)
     table.unlink()
     with pytest.raises(DatasetError, match=r"scene\.json: cannot be read"):
@@ -185,8 +185,8 @@ def test_nuscenes_mistakes_are_named(tmp_path: Path) -> None:
     ("arguments", "message"),
     [
         (["none.csv", "out", "--scans", "s"], "none.csv: no such file or folder"),
-        (["own", "out"], "--scans FOLDER goes with --from boxes"),
-        (["own", "out", "--from", "nuscenes", "--scans", "s"], "--scans FOLDER goes with --from boxes"),
+        (["own", "out"], "--scans FOLDER is for --from boxes"),
+        (["own", "out", "--from", "nuscenes", "--scans", "s"], "--scans FOLDER is for --from boxes"),
         (["own/labels.jsonl", "own/scans", "--scans", "own/scans"], "scans"),
     ],
 )

@@ -119,7 +119,7 @@ ATTRIBUTES = "<!DOCTYPE boost_serialization [<!ATTLIST item x CDATA 'y'>]>"
 )
 def test_files_that_are_no_tracklets_are_refused(tmp_path: Path, old: str, new: str, message: str) -> None:
     (tmp_path / "tracklet_labels.xml").write_text(TRACKLETS.replace(old, new))
-    with pytest.raises(DatasetError, match=f"tracklet_labels.xml: no tracklets of KITTI .*{message}"):
+    with pytest.raises(DatasetError, match=f"tracklet_labels.xml: not a KITTI tracklet file .*{message}"):
         read_kitti_raw(tmp_path)
 
 
@@ -131,7 +131,7 @@ def test_files_that_are_no_tracklets_are_refused(tmp_path: Path, old: str, new: 
         ("<tx>12</tx>", "<tx>nan</tx>", "boxes: 1, .*tracklet 0, pose 0: .*not 4 finite numbers", 1),
         ("<rz>0.4</rz>", "<rz>90</rz>", "boxes: 1, .*no box of a Van", 1),
         ("<l>4.5</l>", "", "tracklets: 1, .*could not convert", 0),
-        ("<objectType>Van</objectType>", "", "tracklets: 1, .*objectType is '', no name", 0),
+        ("<objectType>Van</objectType>", "", "tracklets: 1, .*objectType is '', not a name", 0),
         ("<first_frame>1", "<first_frame>x", "tracklets: 1, .*invalid literal", 0),
     ],
 )

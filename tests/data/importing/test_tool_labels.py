@@ -110,7 +110,7 @@ def test_degrees_cannot_pass_for_radians(tmp_path: Path, tool: str) -> None:
     stated = "-0.3707" if tool == "supervisely" else "1.2"
     (path,) = [one for one in source.rglob("*") if one.suffix in (".json", ".txt") and stated in one.read_text()]
     path.write_text(path.read_text().replace(stated, "95.1"))
-    with pytest.raises(DatasetError, match=r"yaw is 95\.1\d*, more than a turn .*degrees by pi / 180"):
+    with pytest.raises(DatasetError, match=r"yaw is 95\.1\d*, more than a full turn .*degrees by pi / 180"):
         read(source, tool)
 
 
@@ -216,7 +216,7 @@ def test_detect_correct_and_import(tmp_path: Path) -> None:
     out, scans = tmp_path / "out", tmp_path / "scans"
     keys = ("x_m", "y_m", "z_m", "length_m", "width_m", "height_m", "yaw_rad")
     importing = ("import", out / "labelcloud", tmp_path / "data", "--scans", scans)
-    with pytest.raises(ConfigError, match=r"--write best: no such format; there are labelcloud, "):
+    with pytest.raises(ConfigError, match=r"--write best: no such format; available: labelcloud, "):
         invoke("detect", "--out", out, "--write", "best", "--no-pictures")
     invoke("detect", "--out", out, "--write", "labelcloud", "--no-pictures")
     detected = json.loads((out / "detections.jsonl").read_text())
@@ -226,5 +226,5 @@ def test_detect_correct_and_import(tmp_path: Path) -> None:
     split = BoxSplit(tmp_path / "data", "train")
     found = split.records(split.frame_ids[0]).boxes
     np.testing.assert_allclose(found, [[box[key] for key in keys] for box in detected["boxes"]], atol=5e-5)
-    with pytest.raises(ConfigError, match=r"--from nope: no such format; there are boxes, labelcloud, "):
+    with pytest.raises(ConfigError, match=r"--from nope: no such format; available: boxes, labelcloud, "):
         invoke(*importing, "--from", "nope")

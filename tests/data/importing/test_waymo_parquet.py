@@ -74,7 +74,7 @@ def test_mistakes_are_named(tmp_path: Path) -> None:
         read_waymo(tmp_path, tmp_path / "out")
     calibration.write_bytes(b"no parquet")
     for _ in range(2):  # the folder is marked as ours before anything else is read
-        with pytest.raises(DatasetError, match=r"lidar_calibration/segment\.parquet: no readable parquet file"):
+        with pytest.raises(DatasetError, match=r"lidar_calibration/segment\.parquet: not a readable parquet file"):
             read_waymo(source, tmp_path / "out")
     calibration.write_bytes((source / "lidar_box" / "segment.parquet").read_bytes())
     with pytest.raises(DatasetError, match=r"no column `key\.laser_name`"):

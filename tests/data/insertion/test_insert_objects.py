@@ -222,7 +222,7 @@ def test_a_class_without_objects_is_named(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("proportions", "message"),
-    [({"Bus": 1.0}, r"proportions\.Bus: no such class; there are Car, "), ({"Car": 0.0}, "all are 0")],
+    [({"Bus": 1.0}, r"proportions\.Bus: no such class; available: Car, "), ({"Car": 0.0}, "all are 0")],
 )
 def test_impossible_proportions_are_refused(proportions: dict[str, float], message: str) -> None:
     with pytest.raises(ConfigError, match=message):

@@ -105,7 +105,7 @@ def test_the_command_writes_what_it_then_inspects(tmp_path: Path) -> None:
     output = invoke("inspect", root, "-c", "asca_small_sim", "--propose", path)
     assert f"asca train {path}" in output.replace("\n", "")
     assert load_config(path).model.spec.class_names == ("Forklift", "Pallet")
-    with pytest.raises(OutputError, match=r"own\.yaml: is there already"):
+    with pytest.raises(OutputError, match=r"own\.yaml: already exists"):
         invoke("inspect", root, "-c", "asca_small_sim", "--propose", path)
 
 

@@ -96,7 +96,7 @@ def test_json_replaces_its_own_report_alone(data: Path, tmp_path: Path, monkeypa
     monkeypatch.setattr(work, lambda *_, **__: pytest.fail("told too late"))
     for path in (tmp_path / "other.json", config, label, tmp_path / "link.json", tmp_path):
         before = path.read_bytes() if path.is_file() else b""
-        message = r"`asca inspect --json` did not write it|is a link|is a folder; choose a file's name"
+        message = r"`asca inspect --json` did not write it|is a link|is a folder; choose the name of a file"
         with pytest.raises(OutputError, match=f"{path.name}: ({message})"):
             inspect(data, config=config, json=path)
         assert before == (path.read_bytes() if path.is_file() else b"")

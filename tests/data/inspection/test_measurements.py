@@ -109,4 +109,4 @@ def test_whole_yaws_are_doubted(change: Callable[[np.ndarray], np.ndarray], tmp_
     split = open_split(rewritten(tmp_path / "data", change))
     inspection = inspect_dataset(split, SPEC, DataConfig(workers=0))
     texts = [item.text for item in findings(inspection, SPEC, 1) if "whole numbers" in item.text]
-    assert ["radians are wanted" in text and "pi / 180" in text for text in texts] == [True] * (change is whole)
+    assert ["in radians" in text and "pi / 180" in text for text in texts] == [True] * (change is whole)

@@ -96,7 +96,7 @@ def test_image_size_is_read_from_the_png_or_assumed(root):
     assert split.image_size_wh("000001") == (1224, 370)
     for damaged in (b"", start[:20], b"\xff\xd8\xff\xe0" + bytes(40), start[:16] + bytes(8)):
         split.image_path("000001").write_bytes(damaged)
-        assert_one_line(split.image_path("000001"), ["no PNG"], lambda: split.image_size_wh("000001"))
+        assert_one_line(split.image_path("000001"), ["not a PNG"], lambda: split.image_size_wh("000001"))
 
 
 # --- real frames, where there are some

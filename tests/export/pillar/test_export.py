@@ -117,7 +117,7 @@ def test_graphs_that_are_not_the_model_are_refused_and_the_old_bundle_stays(
     export_backbone = graphs.export_backbone
     wrong = FastBackbone(other)
     monkeypatch.setattr(graphs, "export_backbone", lambda _, shape, path: export_backbone(wrong, shape, path))
-    with pytest.raises(ExportError, match=r"scan 0: PyTorch and onnxruntime part at stage head `boxes`: .* 0\.01"):
+    with pytest.raises(ExportError, match=r"scan 0: PyTorch and onnxruntime differ at stage head `boxes`: .* 0\.01"):
         export_pillar_bundle(tiny_checkpoint("channel"), tmp_path / "bundle", SCANS)
     assert {path.name: path.read_bytes() for path in (tmp_path / "bundle").iterdir()} == before
     assert [path.name for path in tmp_path.iterdir()] == ["bundle"], "temporary files are left"

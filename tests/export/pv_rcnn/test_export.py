@@ -149,7 +149,7 @@ def test_other_weights_are_no_parity(trained: Trained, part: str, stage: str) ->
     try:
         with torch.no_grad():
             weight.add_(0.5)
-        with pytest.raises(ExportError, match=f"part at stage ({stage})"):
+        with pytest.raises(ExportError, match=f"differ at stage ({stage})"):
             check_pv_rcnn_parity(detector.network, PvRcnnPipeline(folder, bundle), SCANS[:1])
     finally:
         with torch.no_grad():

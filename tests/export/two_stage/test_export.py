@@ -199,7 +199,7 @@ def test_a_refiner_with_other_weights_is_no_parity(trained: tuple[Path, Path], t
     with torch.no_grad():
         for weight in detector.refiner.head.confidence.parameters():
             weight.fill_(torch.nan)
-    with pytest.raises(ExportError, match="part at stage refine `confidence`"):
+    with pytest.raises(ExportError, match="differ at stage refine `confidence`"):
         check_refine_parity(detector.refiner, stage, pipeline, model, SCANS[:1])
     with pytest.raises(ExportError, match="at least 8"):
         export_refine_bundle(checkpoint, tmp_path / "bundle", SCANS[:1])

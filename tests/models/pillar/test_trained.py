@@ -102,9 +102,9 @@ def test_teachers_that_do_not_fit_are_refused(teacher: str, tmp_path: Path) -> N
     Distillation(with_network(pillar_channels=8, upsample_channels=8), teacher)  # a smaller detector
     narrower = dataclasses.replace(SPEC, grid=dataclasses.replace(SPEC.grid, y_range_m=(-5.12, 5.12)))
     other = PillarModel(spec=narrower, network=NETWORK)
-    with pytest.raises(ConfigError, match=r"teacher\.ckpt: its model\.spec is another"):
+    with pytest.raises(ConfigError, match=r"teacher\.ckpt: its model\.spec differs"):
         Distillation(dataclasses.replace(CONFIG, model=other), teacher)
-    with pytest.raises(ConfigError, match=r"teacher\.ckpt: its neck is another"):
+    with pytest.raises(ConfigError, match=r"teacher\.ckpt: its neck differs"):
         Distillation(with_network(neck="sparse"), teacher)
     with pytest.raises(ConfigError, match=r"train\.teacher = .*only model\.kind pillar"):
         Distillation(dataclasses.replace(CONFIG, model=RefineModel(), augment=STILL_OBJECTS), teacher)

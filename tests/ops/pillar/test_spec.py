@@ -44,7 +44,7 @@ def test_anchors_are_made_once_and_thresholds_set_for_all_or_by_name() -> None:
     assert [spec.score_threshold for spec in both.classes] == [0.11, 0.11]
     one = both.with_score_threshold({"Pedestrian": 0.5})
     assert [spec.score_threshold for spec in one.classes] == [0.11, 0.5]
-    with pytest.raises(ConfigError, match="Tram: no such class; there are Car, Pedestrian"):
+    with pytest.raises(ConfigError, match="Tram: no such class; available: Car, Pedestrian"):
         SPEC.with_score_threshold({"Tram": 0.5})
     with pytest.raises(ConfigError, match="score_threshold 2 of class Car"):
         SPEC.with_score_threshold({"Car": 2.0})

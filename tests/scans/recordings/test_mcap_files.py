@@ -88,7 +88,7 @@ def test_a_topic_without_a_schema_can_be_named(tmp_path: Path) -> None:
     scans = read_scans(path, "/lidar")
     assert [one.time_ns for one in scans] == stamps(2) and all(one.scan is not None for one in scans)
     (one,) = read_scans(path, "/note")
-    assert one.scan is None and "no readable PointCloud2" in str(one.error_text)
+    assert one.scan is None and "not a readable PointCloud2" in str(one.error_text)
 
 
 @pytest.mark.parametrize(

@@ -172,7 +172,7 @@ def test_files_with_damage(tmp_path: Path, suffix: str) -> None:
         assert 5 <= sum(1 for _ in recording.messages("/lidar")) < 40
         assert str(recording.damage).startswith(f"{path}: ends early")
     path.write_bytes(b"not packed")
-    with pytest.raises(ScanError, match=rf"b\.mcap{suffix}: no readable {suffix} file .*; copy or record it again$"):
+    with pytest.raises(ScanError, match=rf"b\.mcap{suffix}: not a readable {suffix} file .*; copy or record it again$"):
         open_recording(path)
 
 
@@ -196,7 +196,7 @@ def test_copies_are_said_and_removed(tmp_path: Path, monkeypatch: pytest.MonkeyP
     _, notes = RecordedScans(recording, recording.point_cloud_topic(), 1.0).mounting(ScanSettings())
     assert notes[0].startswith(f"{tmp_path / 'a.mcap.zst'}: unpacked to {copy} for this run")
     assert notes[1] == "/lidar: 3 scans"
-    with pytest.raises(ScanError, match=r"b\.mcap\.zst: no readable MCAP"):
+    with pytest.raises(ScanError, match=r"b\.mcap\.zst: not a readable MCAP"):
         open_recording(tmp_path / "b.mcap.zst")
     del recording
     gc.collect()

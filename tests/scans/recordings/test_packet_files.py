@@ -110,7 +110,7 @@ def test_packets_of_a_velodyne_in_a_recording(encoding: Encoding) -> None:
     assert cloud.points.reflectance is not None and len(cloud.points.xyz) == pytest.approx(28_900, rel=0.02)
     assert np.linalg.norm(cloud.points.xyz, axis=1) == pytest.approx(10, abs=0.2)
     assert cloud.points.reflectance == pytest.approx(0.2)
-    with pytest.raises(ScanError, match="no readable point cloud of Velodyne"):
+    with pytest.raises(ScanError, match="not a readable point cloud of Velodyne"):
         read_point_cloud(Message(1, data[: len(data) // 2], encoding), "a", kind)
     empty = types.types["velodyne_msgs/msg/VelodyneScan"](header=header, packets=[])
     data = bytes(write(empty, "velodyne_msgs/msg/VelodyneScan"))
@@ -164,7 +164,7 @@ class PacketRecording(Recording):
         return Message(time_ns, bytes(self._types.serialize_cdr(self._types.types[kind](**values), kind)), "cdr")
 
 
-@pytest.mark.parametrize(("metadata", "message"), [(None, "no metadata of the Ouster"), ("{}", "no readable metadata")])
+@pytest.mark.parametrize(("metadata", "message"), [(None, "no metadata of the Ouster"), ("{}", "unreadable metadata")])
 def test_packets_of_an_ouster_in_a_recording_need_its_metadata(metadata: str | None, message: str) -> None:
     recording = PacketRecording(metadata, [])
     with pytest.raises(ScanError, match=f"/ouster/metadata: {message}"):

@@ -95,5 +95,5 @@ def test_contradictions_are_named(change: Callable[[Any], object], message: str)
     change(cloud)
     with pytest.raises(ScanError, match=message):
         read(cloud)
-    with pytest.raises(ScanError, match="no readable PointCloud2"):
+    with pytest.raises(ScanError, match="not a readable PointCloud2"):
         read(b"torn")

@@ -110,9 +110,9 @@ def test_messages_that_a_rosbag2_counts_and_that_are_gone_are_damage(tmp_path: P
     ("name", "content", "said"),
     [
         ("a.mcap", b"", "empty"),
-        ("a.mcap", b"no recording at all" * 9, "no readable MCAP"),
-        ("a.db3", b"SQLite or not" * 99, "no readable rosbag2"),
-        ("a.bag", b"#ROSBAG V9.9\n" * 99, "no readable ROS 1 bag"),
+        ("a.mcap", b"no recording at all" * 9, "not a readable MCAP"),
+        ("a.db3", b"SQLite or not" * 99, "not a readable rosbag2"),
+        ("a.bag", b"#ROSBAG V9.9\n" * 99, "not a readable ROS 1 bag"),
     ],
 )
 def test_what_is_no_recording_is_named(tmp_path: Path, name: str, content: bytes, said: str) -> None:
@@ -128,7 +128,7 @@ def test_scans_that_cannot_be_read_are_told_one_by_one(tmp_path: Path) -> None:
     messages = list(zip(stamps(3), (clouds(1)[0][1], b"torn", flat), strict=True))
     scans = read_scans(write_mcap(tmp_path / "a.mcap", {"/lidar": messages}))
     assert [one.scan is None for one in scans] == [False, True, True]
-    assert "a.mcap, /lidar, message 1: no readable PointCloud2" in str(scans[1].error_text)
+    assert "a.mcap, /lidar, message 1: not a readable PointCloud2" in str(scans[1].error_text)
     assert "message 2: no field z" in str(scans[2].error_text)
 
 
