@@ -319,6 +319,7 @@ def _print_scans(result: "DetectedScans", files: Sequence[Path], out: Path, cons
     """Print boxes or a line per scan, remarks and times; PartialError if some scans failed."""
     from asca_deploy.auto import summary
     from asca_pillars.cli import detect_tables as show
+    from asca_pillars.cli.progress import print_remark
 
     detector = result.detector
     if detector.candidates:
@@ -327,7 +328,7 @@ def _print_scans(result: "DetectedScans", files: Sequence[Path], out: Path, cons
     is_single = asked == 1
     console.print(show.boxes(result[0].path, result[0].detections) if is_single else show.scans(result, detector.spec))
     for line in result.remarks:
-        show.remark(console, line)
+        print_remark(console, line)
     reports = [scan.detections.report for scan in result]
     while len(reports) < TIMED_FRAMES:
         reports.append(detector(result.last_points).report)

@@ -5,18 +5,11 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from rich.console import Console
 from rich.table import Table
 
 from asca_deploy import Detector, FrameReport, ScanDetections
 from asca_deploy.detect_scans import DetectedScans
-from asca_pillars.base.errors import printable
 from asca_pillars.detection.spec import DetectorSpec
-
-
-def remark(console: Console, text: str) -> None:
-    """Print a line that the user is to notice; it may quote names of files and topics."""
-    console.print(printable(text), style="yellow", soft_wrap=True)
 
 
 def boxes(path: Path, detections: ScanDetections) -> Table:

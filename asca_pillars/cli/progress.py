@@ -9,6 +9,11 @@ from rich.status import Status
 from asca_pillars.base.errors import printable
 
 
+def print_remark(console: Console, text: str) -> None:
+    """Print a line that the user is to notice; it may quote names of files and topics."""
+    console.print(printable(text), style="yellow", soft_wrap=True)
+
+
 class Bars:
     """Progress bars for the steps reported by a function; pass it as `progress`, in a `with` block.
 
@@ -51,8 +56,8 @@ class Bars:
         self._status.update(text)
 
     def remark(self, text: str) -> None:
-        """Print a line that the user is to notice; it may quote names of files and topics."""
-        self._console.print(printable(text), style="yellow", soft_wrap=True)
+        """Print a line that the user is to notice."""
+        print_remark(self._console, text)
 
     def _stop(self) -> None:
         if self._bar is not None:

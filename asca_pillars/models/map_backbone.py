@@ -44,7 +44,7 @@ CHUNK_VALUES = 1 << 20  # gathered at a time: on a CPU they stay in its cache; a
 GPU_CHUNK_VALUES = 1 << 28  # half a GiB in bfloat16; there each chunk costs launches
 
 
-def rulebook_conv(features: Tensor, weight: Tensor, table: Tensor, back: Tensor | None = None) -> Tensor:
+def rulebook_conv(features: Tensor, weight: Tensor, rulebook: Tensor, back: Tensor | None = None) -> Tensor:
     """Compute a convolution without bias at M output cells: (N, C) -> (M, outputs).
 
     Under autocast it computes in the lower precision, as a convolution would.
@@ -52,33 +52,33 @@ def rulebook_conv(features: Tensor, weight: Tensor, table: Tensor, back: Tensor 
     Args:
         features: (N, C).
         weight: (outputs, C, *kernel) as PyTorch stores a convolution's, K cells in its kernel.
-        table: (M, K) int32 rows of `features`, N where there is none.
+        rulebook: (M, K) int32 rows of `features`, N where there is none.
         back: (N, K) int32 the inverse, rows of the output, M where there is none; needed for the features' gradient.
-            Of a submanifold convolution it is the same table with its taps reversed, and taken to be so if not given.
+            Of a submanifold convolution it is the rulebook with its taps reversed, and taken to be so if not given.
     """
     device = features.device.type
     if torch.is_autocast_enabled(device):
         features, weight = (tensor.to(torch.get_autocast_dtype(device)) for tensor in (features, weight))
-    result: Tensor = _RulebookConv.apply(features, weight, table, table.flip(1) if back is None else back)
+    result: Tensor = _RulebookConv.apply(features, weight, rulebook, rulebook.flip(1) if back is None else back)
     return result
 
 
 class _RulebookConv(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, features: Tensor, weight: Tensor, table: Tensor, back: Tensor) -> Tensor:
-        ctx.save_for_backward(features, weight, table, back)
-        return _gathered_product(features, table, _by_output(weight).T)
+    def forward(ctx: Any, features: Tensor, weight: Tensor, rulebook: Tensor, back: Tensor) -> Tensor:
+        ctx.save_for_backward(features, weight, rulebook, back)
+        return _gathered_product(features, rulebook, _by_output(weight).T)
 
     @staticmethod
     def backward(ctx: Any, *gradients: Any) -> tuple[Tensor | None, Tensor | None, None, None]:
-        features, weight, table, back = ctx.saved_tensors
+        features, weight, rulebook, back = ctx.saved_tensors
         gradient = gradients[0].to(features.dtype)
         of_features = of_weight = None
         if ctx.needs_input_grad[0]:
-            by_tap = _by_output(weight).unflatten(1, (table.shape[1], -1)).transpose(0, 1)  # (K, outputs, C)
+            by_tap = _by_output(weight).unflatten(1, (rulebook.shape[1], -1)).transpose(0, 1)  # (K, outputs, C)
             of_features = _gathered_product(gradient, back, by_tap.flatten(0, 1))
         if ctx.needs_input_grad[1]:
-            of_weight = _weight_gradient(features, table, gradient).to(weight.dtype)
+            of_weight = _weight_gradient(features, rulebook, gradient).to(weight.dtype)
             kernel = weight.shape[2:]
             of_weight = of_weight.unflatten(1, (*kernel, -1)).movedim(-1, 1)
         return of_features, of_weight, None, None
@@ -89,30 +89,30 @@ def _by_output(weight: Tensor) -> Tensor:
     return weight.movedim(1, -1).flatten(1)
 
 
-def _gathered_product(features: Tensor, table: Tensor, matrix: Tensor) -> Tensor:
-    """Multiply the rows gathered by the table (M, K), side by side, by the matrix (K * C, outputs)."""
-    if len(table) == 0:
+def _gathered_product(features: Tensor, rulebook: Tensor, matrix: Tensor) -> Tensor:
+    """Multiply the rows gathered by the rulebook (M, K), side by side, by the matrix (K * C, outputs)."""
+    if len(rulebook) == 0:
         return features.new_zeros(0, matrix.shape[1])
-    return torch.cat([(gathered @ matrix)[:rows] for rows, gathered in _chunks(features, table)])
+    return torch.cat([(gathered @ matrix)[:rows] for rows, gathered in _chunks(features, rulebook)])
 
 
-def _weight_gradient(features: Tensor, table: Tensor, gradient: Tensor) -> Tensor:
+def _weight_gradient(features: Tensor, rulebook: Tensor, gradient: Tensor) -> Tensor:
     """Return the gradient of the weight, (outputs, K * C), summed over chunks in float32 at least."""
     total = torch.promote_types(features.dtype, torch.float32)
-    matrix = torch.zeros(gradient.shape[1], table.shape[1] * features.shape[1], dtype=total, device=features.device)
+    matrix = torch.zeros(gradient.shape[1], rulebook.shape[1] * features.shape[1], dtype=total, device=features.device)
     first = 0
-    for rows, gathered in _chunks(features, table):
+    for rows, gathered in _chunks(features, rulebook):
         matrix += pad_rows(gradient[first : first + rows]).T @ gathered
         first += rows
     return matrix
 
 
-def _chunks(features: Tensor, table: Tensor) -> Iterator[tuple[int, Tensor]]:
+def _chunks(features: Tensor, rulebook: Tensor) -> Iterator[tuple[int, Tensor]]:
     """Yield for each chunk its number of rows, and its gathered rows (m, K * C), followed by zeros."""
     padded = F.pad(features, (0, 0, 0, 1))
-    values = table.shape[1] * features.shape[1]
+    values = rulebook.shape[1] * features.shape[1]
     at_once = GPU_CHUNK_VALUES if features.is_cuda else CHUNK_VALUES
-    for part in table.split(rounded_rows(max(at_once // values, 1))):
+    for part in rulebook.split(rounded_rows(max(at_once // values, 1))):
         entries = pad_rows(part, len(features))
         yield len(part), padded.index_select(0, entries.flatten()).view(len(entries), values)
 

@@ -92,7 +92,7 @@ def golden_stages(pipeline: PillarPipeline | RefinePipeline, points: NDArray[np.
         },
         "encode": {"pillar_features": features},
         # Before the canvas is used for the next scan.
-        ("scatter" if first.bundle.pillar.neck == "dense" else "tables"): _placed(placed),
+        ("scatter" if first.bundle.pillar.neck == "dense" else "rulebooks"): _placed(placed),
     }
     if isinstance(pipeline, RefinePipeline):
         return {**stages, **_second_stage(pipeline, first.backbone.infer_with_neck(placed), points)}

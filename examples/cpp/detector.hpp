@@ -20,7 +20,7 @@
 #include "boxes.hpp"
 #include "grid.hpp"
 #include "pillars.hpp"
-#include "tables.hpp"
+#include "rulebooks.hpp"
 
 namespace detail {
 
@@ -60,13 +60,13 @@ inline std::vector<Ort::Value> run(Ort::Session& graph, Values given, const std:
     return graph.Run({}, pointers.data(), values.data(), values.size(), wanted.data(), wanted.size());
 }
 
-inline Values table_inputs(const NeckTables& tables) {
+inline Values rulebook_inputs(const NeckRulebooks& rulebooks) {
     Values given;
-    for (size_t number = 0; number < tables.levels.size(); ++number) {
-        const NeckTables::Level& level = tables.levels[number];
+    for (size_t number = 0; number < rulebooks.levels.size(); ++number) {
+        const NeckRulebooks::Level& level = rulebooks.levels[number];
         const std::string suffix = "_" + std::to_string(number);
-        const auto taps = [](const std::vector<int32_t>& table) {
-            return tensor(table, {static_cast<int64_t>(table.size()) / 9, 9});
+        const auto taps = [](const std::vector<int32_t>& rulebook) {
+            return tensor(rulebook, {static_cast<int64_t>(rulebook.size()) / 9, 9});
         };
         given.emplace("strided" + suffix, taps(level.strided));
         given.emplace("first" + suffix, taps(level.first));
@@ -125,7 +125,7 @@ public:
         empty_ = pillar.at("canvas").at("empty").get<std::vector<T>>();
         empty_.resize(pillar.at("channels"));
         if (pillar.value("neck", "dense") == "sparse")
-            tables_.emplace(grid_.ny, grid_.nx, pillar.at("active_cells") == "fine");
+            rulebooks_.emplace(grid_.ny, grid_.nx, pillar.at("active_cells") == "fine");
     }
 
     // The boxes of finite points (N, 4), x, y, z in m, reflectance 0..1; best first.
@@ -134,19 +134,19 @@ public:
         lap_start_ = std::chrono::steady_clock::now();
         const Pillars& pillars = pillarizer_.pillarize(points);
         lap("pillarize");
-        if (tables_ && pillars.cells.empty()) return {};
+        if (rulebooks_ && pillars.cells.empty()) return {};
         Ort::Value features{nullptr};
         if (!pillars.cells.empty()) features = encode(pillars);
         lap("encode");
         detail::Values given;
         std::vector<T> canvas;
         const std::vector<int32_t>* head_cells = nullptr;
-        if (tables_) {
-            const NeckTables& tables = tables_->build(pillars.cells);
-            head_cells = &tables.head_cells;
-            given = detail::table_inputs(tables);
+        if (rulebooks_) {
+            const NeckRulebooks& rulebooks = rulebooks_->build(pillars.cells);
+            head_cells = &rulebooks.head_cells;
+            given = detail::rulebook_inputs(rulebooks);
             given.emplace("pillar_features", std::move(features));
-            lap("tables");
+            lap("rulebooks");
         } else {
             canvas = scatter(features ? features.GetTensorData<T>() : nullptr, pillars.cells);
             const auto channels = static_cast<int64_t>(empty_.size());
@@ -201,6 +201,6 @@ private:
     Pillarizer pillarizer_;
     std::vector<float> yaws_;
     std::vector<T> empty_;                    // (C,) of a cell without a pillar
-    std::optional<NeckTableBuilder> tables_;  // of a sparse neck
+    std::optional<NeckRulebookBuilder> rulebooks_;  // of a sparse neck
     std::chrono::steady_clock::time_point lap_start_;
 };

@@ -1,8 +1,8 @@
 """The trained sparse neck and head as a chain of matrix products, the form that its graph has.
 
-A batch normalization is part of the weights before it. A convolution by table reads the rows of its taps side by side,
-so it is one product; an upsampling whose kernel equals its stride is one product for each active parent, whose
-outputs are then picked at head cells; the head's three convolutions are one product.
+A batch normalization is part of the weights before it. A sparse convolution reads the rows of its taps side by side, so
+it is one product; an upsampling whose kernel equals its stride is one product for each active parent, whose outputs are
+then picked at head cells; the head's three convolutions are one product.
 
 In ONNX a layer is Concat (row of zeros), Gather, Reshape, Gemm, Relu.
 
@@ -63,11 +63,11 @@ class RowGraph:
         """Declare a node's result (rows, width) an output."""
         self._outputs.append(helper.make_tensor_value_info(name, kind, [rows, width]))
 
-    def gather(self, owner: str, rows: str, missing: NDArray[Any], table: str, taps: int) -> str:
-        """Gather rows by the table (M, taps), the row `missing` (C,) behind the last: (M, taps * C)."""
-        self.add_input(table, TensorProto.INT32, f"{table}_rows", taps)
+    def gather(self, owner: str, rows: str, missing: NDArray[Any], rulebook: str, taps: int) -> str:
+        """Gather rows by the rulebook (M, taps), the row `missing` (C,) behind the last: (M, taps * C)."""
+        self.add_input(rulebook, TensorProto.INT32, f"{rulebook}_rows", taps)
         padded = self.node("Concat", owner, "padded", rows, self.constant(owner, "missing", missing[None]), axis=0)
-        gathered = self.node("Gather", owner, "gathered", padded, table, axis=0)
+        gathered = self.node("Gather", owner, "gathered", padded, rulebook, axis=0)
         return self.reshape(owner, "rows", gathered, taps * len(missing))
 
     def reshape(self, owner: str, what: str, rows: str, width: int, count: int = -1) -> str:
@@ -146,11 +146,11 @@ class RowGraph:
 
 
 class NeckProduct(NamedTuple):
-    """A convolution by table, followed by a ReLU."""
+    """A sparse convolution, followed by a ReLU."""
 
     name: str
     """Name of its product in `SparseBackbone.products`."""
-    table: str
+    rulebook: str
     """The input of the graph that it gathers by."""
 
 
@@ -221,7 +221,7 @@ class SparseBackbone(nn.Module):
         for level in self.levels:
             for layer in level.convolutions:
                 padded = torch.cat([features, missing[None]])
-                read = padded[inputs[layer.table].long()].flatten(1)
+                read = padded[inputs[layer.rulebook].long()].flatten(1)
                 features = torch.relu(self.product(layer.name)(read))
                 missing = features.new_zeros(features.shape[1])
                 yield layer.name, read, features
@@ -279,7 +279,7 @@ def export_sparse_backbone(
     for level in backbone.levels:
         for layer in level.convolutions:
             taps = backbone.product(layer.name).in_features // len(missing)
-            read = graph.gather(layer.name, rows, missing, layer.table, taps)
+            read = graph.gather(layer.name, rows, missing, layer.rulebook, taps)
             rows = graph.relu(layer.name, graph.product(layer.name, read, steps=steps), steps=steps)
             missing = np.zeros(backbone.product(layer.name).out_features, row_type)
         channels = backbone.product(level.upsample).out_features // level.stride**2
@@ -299,7 +299,7 @@ def sparse_multiply_accumulates(backbone: SparseBackbone, rulebooks: NeckRuleboo
     inputs, total = rulebook_inputs(rulebooks), 0
     for level in backbone.levels:
         for layer in level.convolutions:
-            rows = len(inputs[layer.table])
+            rows = len(inputs[layer.rulebook])
             total += rows * backbone.product(layer.name).weight.numel()
         total += rows * backbone.product(level.upsample).weight.numel()
     return total + len(rulebooks.head_cells) * backbone.product(HEAD).weight.numel()

@@ -112,12 +112,12 @@ def sparse_backbone_graph() -> onnx.ModelProto:
         nodes.append(helper.make_node("Gemm", [given, f"{name}.weight", f"{name}.bias"], [name]))
         return name
 
-    def gathered(table: str, given: str, channels: int) -> str:
-        weights[f"{table}.shape"] = np.array([-1, channels], np.int64)
-        nodes.append(helper.make_node("Pad", [given, "one_row"], [f"{table}.padded"]))
-        nodes.append(helper.make_node("Gather", [f"{table}.padded", table], [f"{table}.rows"]))
-        nodes.append(helper.make_node("Reshape", [f"{table}.rows", f"{table}.shape"], [f"{table}.taps"]))
-        return f"{table}.taps"
+    def gathered(rulebook: str, given: str, channels: int) -> str:
+        weights[f"{rulebook}.shape"] = np.array([-1, channels], np.int64)
+        nodes.append(helper.make_node("Pad", [given, "one_row"], [f"{rulebook}.padded"]))
+        nodes.append(helper.make_node("Gather", [f"{rulebook}.padded", rulebook], [f"{rulebook}.rows"]))
+        nodes.append(helper.make_node("Reshape", [f"{rulebook}.rows", f"{rulebook}.shape"], [f"{rulebook}.taps"]))
+        return f"{rulebook}.taps"
 
     for level, children in enumerate((1, 4)):
         inputs.append(_info(f"strided_{level}", [f"M{level}", 9], TensorProto.INT32))

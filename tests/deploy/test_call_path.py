@@ -17,9 +17,9 @@ ROOTS = [str(Path(str(package.__file__)).parent) for package in (asca_pillars, a
 
 
 @pytest.mark.parametrize(("bundle", "most"), [(DENSE_INT8, 15), ("fast", 18)])
-def test_a_scan_passes_through_fifteen_files_and_three_of_tables_at_most(bundle: str | Path, most: int) -> None:
+def test_a_scan_passes_through_fifteen_files_and_three_of_rulebooks_at_most(bundle: str | Path, most: int) -> None:
     detector, scan = Detector(bundle), sample_scan_path()
-    detector(read_scan(scan).points)  # creates cached tables
+    detector(read_scan(scan).points)  # creates cached rulebooks
     files: set[str] = set()
 
     def note(frame: FrameType, event: str, _: Any) -> None:

@@ -1,4 +1,4 @@
-"""The C++ example, compiled: tables and boxes of the golden vectors, and refusals of what it cannot run."""
+"""The C++ example, compiled: rulebooks and boxes of the golden vectors, and refusals of what it cannot run."""
 
 import json
 import os
@@ -47,11 +47,13 @@ def detect(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def build_tables(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A program that writes the tables of the scans that it is given."""
+def build_rulebooks(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A program that writes the rulebooks of the scans that it is given."""
     if COMPILER is None:
         pytest.skip("needs a C++ compiler")
-    return build(Path(__file__).parent / "cpp" / "build_tables.cpp", tmp_path_factory.mktemp("cpp") / "build_tables")
+    return build(
+        Path(__file__).parent / "cpp" / "build_rulebooks.cpp", tmp_path_factory.mktemp("cpp") / "build_rulebooks"
+    )
 
 
 def test_cmake_takes_an_unpacked_release(tmp_path: Path) -> None:
@@ -94,23 +96,23 @@ def build(source: Path, program: Path, *flags: str) -> Path:
 
 
 @pytest.mark.parametrize("rule", ["sub", "fine"])
-def test_tables_are_those_of_python(build_tables: Path, rule: MaskRule) -> None:
+def test_rulebooks_are_those_of_python(build_rulebooks: Path, rule: MaskRule) -> None:
     ny, nx = 24, 40
     rng = np.random.default_rng(6)
     # A full map before sparse ones, which must not inherit it; nothing, and the corners alone.
     scans = [np.flatnonzero(rng.random(ny * nx) < share) for share in (1.0, 0.05, 0.0, 0.3)]
     scans.append(np.array([0, nx - 1, (ny - 1) * nx, ny * nx - 1]))
     given = b"".join(np.array([len(cells), *cells], np.int32).tobytes() for cells in scans)
-    answer = subprocess.run([build_tables, str(ny), str(nx), rule], input=given, check=True, capture_output=True)
+    answer = subprocess.run([build_rulebooks, str(ny), str(nx), rule], input=given, check=True, capture_output=True)
     values = np.frombuffer(answer.stdout, np.int32)
     for cells in scans:
         rulebooks = NeckRulebookBuilder(ny, nx, rule).build(cells)
         expected = {**rulebook_inputs(rulebooks), "head_cells": rulebooks.head_cells}
-        for name, table in expected.items():
+        for name, rulebook in expected.items():
             if name.startswith("first") and (rule, name) != ("fine", "first_0"):
-                table = table[:0]  # where nothing grows a graph reads `same`
+                rulebook = rulebook[:0]  # where nothing grows a graph reads `same`
             found, values = values[1 : 1 + values[0]], values[1 + values[0] :]
-            np.testing.assert_array_equal(found, table.reshape(-1), err_msg=name)
+            np.testing.assert_array_equal(found, rulebook.reshape(-1), err_msg=name)
     assert not len(values)
 
 
@@ -155,7 +157,7 @@ def test_repeats_say_what_the_stages_take(
     bundle = request.getfixturevalue("tiny_bundle" if neck == "dense" else "sparse_bundle")
     result = subprocess.run([detect, bundle, tmp_path / "scan.bin", "3"], check=True, capture_output=True, text=True)
     stages = [line.split() for line in result.stderr.splitlines()]
-    placed = "scatter" if neck == "dense" else "tables"
+    placed = "scatter" if neck == "dense" else "rulebooks"
     assert [stage for stage, _, _ in stages] == ["pillarize", "encode", placed, "neck+head", "decode"]
     assert all(float(time) >= 0 and unit == "ms" for _, time, unit in stages)
     assert len(result.stdout.splitlines()) > 2

@@ -19,7 +19,7 @@ from asca_pillars.base.errors import ProviderError
 from tests.export.tiny import CALIBRATION, NOTHING, ONE_POINT, SCANS, sparse_checkpoint
 from tests.helpers.same_detections import same
 
-STAGES = ("pillarize", "encode", "tables", "neck+head", "decode")
+STAGES = ("pillarize", "encode", "rulebooks", "neck+head", "decode")
 
 
 @pytest.fixture(scope="module")
@@ -34,9 +34,9 @@ def test_golden_vectors_hold_the_tables(exported: Callable[[str], Path], rule: s
     detector = Detector(exported(rule), threads=1)
     assert isinstance(detector.pipeline, PillarPipeline)
     stages = golden_stages(detector.pipeline, SCANS[0])
-    assert {"pillar_features", "strided_0", "same_2", "places_1"} < set(stages["tables"])
+    assert {"pillar_features", "strided_0", "same_2", "places_1"} < set(stages["rulebooks"])
     head = stages["neck+head"]
-    assert len(head["scores"]) == len(head["cells"]) == len(stages["tables"]["places_0"])
+    assert len(head["scores"]) == len(head["cells"]) == len(stages["rulebooks"]["places_0"])
     np.testing.assert_array_equal(stages["suppress"]["boxes"], detector(SCANS[0]).boxes)
 
 

@@ -20,7 +20,7 @@ CASES = (
 )
 
 
-def make_tables(
+def make_rulebooks(
     shape: Shape, convolution: Convolution, share: float
 ) -> tuple[CellMap, CellMap, tuple[torch.Tensor, torch.Tensor]]:
     """Input and output cells, and the two tables; cells of submanifold convolutions stay."""
@@ -30,9 +30,9 @@ def make_tables(
         target = source
     else:
         target.activate_joined([(source, convolution.outputs(source.shape, target.shape))])
-    table = target.rulebook(source, convolution.inputs(target.shape, source.shape))
+    rulebook = target.rulebook(source, convolution.inputs(target.shape, source.shape))
     back = source.rulebook(target, convolution.outputs(source.shape, target.shape))
-    return source, target, (torch.from_numpy(table), torch.from_numpy(back))
+    return source, target, (torch.from_numpy(rulebook), torch.from_numpy(back))
 
 
 @pytest.mark.parametrize(("shape", "convolution"), CASES)
@@ -42,7 +42,7 @@ def test_equals_the_dense_convolution(
 ) -> None:
     monkeypatch.setattr(module, "CHUNK_VALUES", chunk)
     torch.manual_seed(0)
-    source, target, (table, back) = make_tables(shape, convolution, share)
+    source, target, (rulebook, back) = make_rulebooks(shape, convolution, share)
     features = torch.randn(len(source), 3, dtype=torch.float64, requires_grad=True)
     weight = torch.randn(5, 3, *convolution.kernel, dtype=torch.float64, requires_grad=True)
     z, y, x = shape
@@ -51,7 +51,7 @@ def test_equals_the_dense_convolution(
         volume.view(y, x, z, 3).permute(3, 2, 0, 1)[None], weight, None, convolution.stride, convolution.padding
     )
     expected = volume[0].permute(2, 3, 1, 0).reshape(-1, 5)[torch.from_numpy(target.cells)]
-    found = rulebook_conv(features, weight, table, None if target is source else back)
+    found = rulebook_conv(features, weight, rulebook, None if target is source else back)
     torch.testing.assert_close(found, expected)
     upstream = torch.randn_like(expected)
     for one, other in zip(
@@ -64,13 +64,13 @@ def test_equals_the_dense_convolution(
 
 def test_autocast_computes_in_bfloat16_and_adds_up_in_float32() -> None:
     torch.manual_seed(0)
-    source, _, (table, back) = make_tables((1, 40, 40), map_convolution(3, padding=1), share=0.5)
+    source, _, (rulebook, back) = make_rulebooks((1, 40, 40), map_convolution(3, padding=1), share=0.5)
     features = torch.randn(len(source), 8, requires_grad=True)
     weight = torch.randn(8, 8, 1, 3, 3, requires_grad=True)
-    expected = rulebook_conv(features, weight, table, back)
+    expected = rulebook_conv(features, weight, rulebook, back)
     (exact,) = torch.autograd.grad(expected.square().sum(), weight)
     with torch.autocast("cpu", torch.bfloat16):
-        found = rulebook_conv(features, weight, table, back)
+        found = rulebook_conv(features, weight, rulebook, back)
     assert found.dtype == torch.bfloat16
     torch.testing.assert_close(found.float(), expected, rtol=0.02, atol=0.2)
     (rounded,) = torch.autograd.grad(found.float().square().sum(), weight)
@@ -80,7 +80,7 @@ def test_autocast_computes_in_bfloat16_and_adds_up_in_float32() -> None:
 
 def test_the_same_bits_in_every_run() -> None:
     torch.manual_seed(0)
-    source, _, (table, back) = make_tables((1, 64, 64), map_convolution(3, padding=1), share=0.4)
+    source, _, (rulebook, back) = make_rulebooks((1, 64, 64), map_convolution(3, padding=1), share=0.4)
     features = torch.randn(len(source), 16, requires_grad=True)
     weight = torch.randn(16, 16, 1, 3, 3, requires_grad=True)
     threads = torch.get_num_threads()
@@ -88,7 +88,7 @@ def test_the_same_bits_in_every_run() -> None:
         torch.set_num_threads(4)
         results = []
         for _ in range(8):
-            found = rulebook_conv(features, weight, table, back)
+            found = rulebook_conv(features, weight, rulebook, back)
             results.append((found.detach(), *torch.autograd.grad(found.square().sum(), (features, weight))))
     finally:
         torch.set_num_threads(threads)

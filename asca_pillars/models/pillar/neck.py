@@ -45,12 +45,12 @@ class SparseRPNNeck(MapBackbone):
         maps = []
         for block, deblock, level in zip(self.blocks, self.deblocks, rulebooks.levels, strict=True):
             for number, (convolution, norm) in enumerate(block_layers(block)):
-                table, back = (
+                rulebook, back = (
                     (level.strided, level.strided_back),
                     (level.first, level.first_back),
                     (level.same, None),
                 )[min(number, 2)]
-                pillars = torch.relu(at_active_cells(norm, rulebook_conv(pillars, convolution.weight, table, back)))
+                pillars = torch.relu(at_active_cells(norm, rulebook_conv(pillars, convolution.weight, rulebook, back)))
             maps.append(_upsampled(deblock, pillars, level.places))
         return torch.cat(maps, dim=1)
 

@@ -235,16 +235,16 @@ _CONVS = 2  # submanifold convolutions of each level but the last
 
 
 class SparseConvBlock(nn.Module):
-    """A convolution by table, BatchNorm over active cells, ReLU; its weight has the shape of a dense convolution's."""
+    """Sparse convolution, BatchNorm over active cells, ReLU; its weight has the shape of a dense convolution's."""
 
     def __init__(self, in_channels: int, channels: int, convolution: Convolution) -> None:
         super().__init__()
         self.convolution = nn.Conv3d(in_channels, channels, convolution.kernel, bias=False)
         self.norm = nn.BatchNorm1d(channels, eps=NORM_EPS, momentum=NORM_MOMENTUM)
 
-    def forward(self, features: Tensor, table: Tensor, back: Tensor | None = None) -> Tensor:
+    def forward(self, features: Tensor, rulebook: Tensor, back: Tensor | None = None) -> Tensor:
         """Apply the block: (N, in_channels) -> (M, channels), see `rulebook_conv`."""
-        return torch.relu(self.norm(rulebook_conv(features, self.convolution.weight, table, back)))
+        return torch.relu(self.norm(rulebook_conv(features, self.convolution.weight, rulebook, back)))
 
 
 class VoxelBackbone(nn.Module):

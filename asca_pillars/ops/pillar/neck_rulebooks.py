@@ -166,10 +166,10 @@ def stack_neck_rulebooks(
     )
 
 
-def rulebook_inputs(tables: NeckRulebooks[Array]) -> dict[str, Array]:
+def rulebook_inputs(rulebooks: NeckRulebooks[Array]) -> dict[str, Array]:
     """Return the rulebooks by the names of a neck graph's inputs; a graph takes those that its layers read."""
     return {
         f"{kind}_{number}": getattr(level, kind)
-        for number, level in enumerate(tables.levels)
+        for number, level in enumerate(rulebooks.levels)
         for kind in ("strided", "first", "same", "places")
     }

@@ -185,7 +185,7 @@ def _fill_flat(
     nx: int,
     start: _Rows,
     missing: np.int32,
-    table: _Rows,
+    rulebook: _Rows,
 ) -> None:
     """Compute `fill_rulebook` where both lattices are one cell high and the kernel is square, several times as fast."""
     nowhere, width = np.uint64(len(start) - 1), len(x_links)
@@ -193,7 +193,7 @@ def _fill_flat(
     for i in range(len(cells)):
         while cells[i] >= (row + 1) * width:
             row += 1
-        x_of, entries = x_links[np.uint64(cells[i] - row * width)], table[np.uint64(i)]
+        x_of, entries = x_links[np.uint64(cells[i] - row * width)], rulebook[np.uint64(i)]
         for ky in range(taps):
             y = y_links[np.uint64(row), np.uint64(ky)]
             for kx in range(taps):
@@ -213,16 +213,16 @@ def fill_rulebook(
     mask: _Masks,
     start: _Rows,
     missing: np.int32,
-    table: _Rows,
+    rulebook: _Rows,
 ) -> None:
-    """Compute `CellMap.table`, column by column: cells (N,) -> indices (N, K)."""
+    """Compute `CellMap.rulebook`, column by column: cells (N,) -> indices (N, K)."""
     depth, width = len(z_links), len(x_links)
     taps_z, taps_y, taps_x = z_links.shape[1], y_links.shape[1], x_links.shape[1]
     if not len(mask) and depth == taps_z == 1 and taps_y == taps_x:
         if taps_x == 3:  # a number that the compiler knows
-            _fill_flat(cells, y_links, x_links, 3, nx, start, missing, table)
+            _fill_flat(cells, y_links, x_links, 3, nx, start, missing, rulebook)
         else:
-            _fill_flat(cells, y_links, x_links, taps_x, nx, start, missing, table)
+            _fill_flat(cells, y_links, x_links, taps_x, nx, start, missing, rulebook)
         return
     first = row = 0
     while first < len(cells):
@@ -242,7 +242,7 @@ def fill_rulebook(
                     place = np.uint64(y * nx + x)
                     bits, begin = bits_of(mask, start, place), start[place]
                 for i in range(first, end):
-                    z_of, entries = z_links[np.uint64(cells[i] - column * depth)], table[np.uint64(i)]
+                    z_of, entries = z_links[np.uint64(cells[i] - column * depth)], rulebook[np.uint64(i)]
                     for kz in range(taps_z):
                         entry = missing
                         z = z_of[np.uint64(kz)]

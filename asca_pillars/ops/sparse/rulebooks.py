@@ -171,9 +171,9 @@ class CellMap:
         With `Convolution.inputs` it is the rulebook of the convolution from `source` to this map. With `outputs` it is
         the inverse for the backward pass: the output, on the map `source`, that read each input.
         """
-        table = np.empty((len(self.cells), math.prod(axis.shape[1] for axis in kernel_maps)), np.int32)
-        self._kernels.fill_rulebook(self.cells, *kernel_maps, source.shape[2], *source.columns, len(source), table)
-        return table
+        rulebook = np.empty((len(self.cells), math.prod(axis.shape[1] for axis in kernel_maps)), np.int32)
+        self._kernels.fill_rulebook(self.cells, *kernel_maps, source.shape[2], *source.columns, len(source), rulebook)
+        return rulebook
 
     def places(self, parents: "CellMap", halvings: int) -> NDArray[np.int32]:
         """Return the row of each active cell of this map among the outputs of a non-overlapping upsampling.
@@ -221,8 +221,8 @@ def stack_rows(rulebooks: Sequence[NDArray[np.int32]], rows: Sequence[int]) -> N
     """
     starts, total = np.concatenate([[0], np.cumsum(rows)]).astype(np.int32), sum(rows)
     moved = [
-        np.where(table == count, np.int32(total), table + start)
-        for table, count, start in zip(rulebooks, rows, starts[:-1], strict=True)
+        np.where(rulebook == count, np.int32(total), rulebook + start)
+        for rulebook, count, start in zip(rulebooks, rows, starts[:-1], strict=True)
     ]
     return np.concatenate(moved)
 

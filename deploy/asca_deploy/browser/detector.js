@@ -5,7 +5,7 @@ import { decodeCandidates, suppress } from "./boxes.js";
 import { changeBox, changePoints, inverse, turnBy } from "./frames.js";
 import { makeGrid, percentBehind } from "./grid.js";
 import { Canvas, pillarize } from "./pillars.js";
-import { NeckTableBuilder } from "./tables.js";
+import { NeckRulebookBuilder } from "./rulebooks.js";
 
 // It would quantize layers that an 8-bit bundle keeps in floating point (docs/BUNDLE.md).
 const OPTIONS = { extra: { optimization: { disable_specified_optimizers: "WeightBiasQuantization" } } };
@@ -33,7 +33,7 @@ export class Detector {
     return detector;
   }
 
-  /** Where the model looks, and what it keeps from scan to scan: `spec`, `grid`, and `tables` or `canvas` of its neck. */
+  /** Where the model looks, and what it keeps from scan to scan: `spec`, `grid`, and `rulebooks` or `canvas` of its neck. */
   field(around) {
     const spec = around ? widenRanges(this.manifest) : this.manifest.spec;
     const name = JSON.stringify(spec.grid);
@@ -41,8 +41,8 @@ export class Detector {
       const { neck, channels, canvas, active_cells: rule } = this.manifest.pillar;
       const grid = makeGrid(spec.grid);
       const sparse = neck === "sparse";
-      const tables = sparse ? new NeckTableBuilder(grid.ny, grid.nx, rule) : undefined;
-      this.fields.set(name, { spec, grid, tables, canvas: sparse ? undefined : new Canvas(grid, channels, canvas) });
+      const rulebooks = sparse ? new NeckRulebookBuilder(grid.ny, grid.nx, rule) : undefined;
+      this.fields.set(name, { spec, grid, rulebooks, canvas: sparse ? undefined : new Canvas(grid, channels, canvas) });
     }
     return this.fields.get(name);
   }
@@ -88,7 +88,7 @@ export class Detector {
     };
     const pillars = await timed("pillarize", () => pillarize(points, grid, spec.limits));
     const features = await timed("encode", () => this.encode(pillars));
-    const placed = await timed(field.tables ? "tables" : "scatter", () => this.place(field, features, pillars.cells));
+    const placed = await timed(field.rulebooks ? "rulebooks" : "scatter", () => this.place(field, features, pillars.cells));
     const maps = await timed("neck+head", () => this.neckAndHead(placed));
     const found = await timed("decode", () => {
       const yaws = this.manifest.pillar.layout.anchor_yaws_rad;
@@ -114,16 +114,16 @@ export class Detector {
   /** What backbone.onnx takes, and of a sparse neck the head cells that it answers for. */
   place(field, features, cells) {
     const { channels, canvas } = this.manifest.pillar;
-    if (!field.tables) {
+    if (!field.rulebooks) {
       field.canvas.scatter(features, cells);
       return { given: { canvas: this.tensor(canvas.type, field.canvas.values, field.canvas.shape) } };
     }
-    const { inputs, headCells } = field.tables.build(cells);
+    const { inputs, headCells } = field.rulebooks.build(cells);
     if (headCells.length === 0) return { headCells };
     const given = { pillar_features: this.tensor(canvas.type, features, [cells.length, channels]) };
-    for (const [name, table] of Object.entries(inputs)) {
-      const shape = name.startsWith("places") ? [table.length] : [table.length / 9, 9];
-      given[name] = this.tensor("int32", table, shape);
+    for (const [name, rulebook] of Object.entries(inputs)) {
+      const shape = name.startsWith("places") ? [rulebook.length] : [rulebook.length / 9, 9];
+      given[name] = this.tensor("int32", rulebook, shape);
     }
     return { given, headCells };
   }

@@ -241,7 +241,7 @@ class SparseBackbone:
         neck_channels: of the graph's output NECK, if it has one.
     """
 
-    stage = "tables"
+    stage = "rulebooks"
 
     def __init__(self, session: Session, bundle: PillarBundle, neck_channels: int = 0) -> None:
         self._session, self._bundle = session, bundle

@@ -51,10 +51,10 @@ class VoxelSample(NamedTuple):
 
 
 class VoxelProduct(NamedTuple):
-    """A convolution by table, followed by a ReLU."""
+    """A sparse convolution, followed by a ReLU."""
 
     name: str
-    table: str
+    rulebook: str
     """The input of the graph that it gathers by."""
     level: str
     """Level of its outputs: conv1 to conv4, or OUT."""
@@ -74,9 +74,9 @@ class VoxelProducts(nn.Module):
             convolutions = [(f"strided_{number}", backbone.down[number - 1])] if number else []
             if number < len(backbone.same):
                 convolutions += [(f"same_{number}", layer) for layer in backbone.same[number].children()]
-            for index, (table, layer) in enumerate(convolutions):
+            for index, (rulebook, layer) in enumerate(convolutions):
                 assert isinstance(layer, SparseConvBlock)
-                self.layers.append(VoxelProduct(f"{level}_{index}", table, level))
+                self.layers.append(VoxelProduct(f"{level}_{index}", rulebook, level))
                 self.products[self.layers[-1].name] = _folded(layer)
 
     def product(self, name: str) -> nn.Linear:
@@ -93,7 +93,7 @@ class VoxelProducts(nn.Module):
         """Yield name, input (M, taps * C) and output (M, outputs) of each product in turn."""
         for layer in self.layers:
             padded = torch.cat([features, features.new_zeros(1, features.shape[1])])
-            read = padded[rulebooks[layer.table].long()].flatten(1)
+            read = padded[rulebooks[layer.rulebook].long()].flatten(1)
             features = torch.relu(self.product(layer.name)(read))
             yield layer.name, read, features
 
@@ -169,7 +169,7 @@ def export_voxels(
     missing = np.zeros(VOXEL_VALUES, np.float32)
     for number, layer in enumerate(backbone.layers):
         product = backbone.product(layer.name)
-        read = graph.gather(layer.name, rows, missing, layer.table, product.in_features // len(missing))
+        read = graph.gather(layer.name, rows, missing, layer.rulebook, product.in_features // len(missing))
         results = graph.product(layer.name, read, steps=counted and number > 0)
         rows = graph.relu(layer.name, results, steps=counted)
         missing = np.zeros(product.out_features, np.uint8 if counted else np.float32)

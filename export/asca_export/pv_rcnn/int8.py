@@ -94,7 +94,7 @@ def _round(
     samples = [
         VoxelSample(
             torch.from_numpy(scan.features),
-            {name: torch.from_numpy(table) for name, table in voxel_inputs(scan.features, scan.levels).items()},
+            {name: torch.from_numpy(rulebook) for name, rulebook in voxel_inputs(scan.features, scan.levels).items()},
         )
         for scan in voxelized
     ]

@@ -7,7 +7,7 @@ const [modules, golden, bundle] = process.argv.slice(2).map((path) => resolve(pa
 const load = (name) => import(pathToFileURL(join(modules, name)));
 const { makeGrid } = await load("grid.js");
 const { pillarize, Canvas } = await load("pillars.js");
-const { NeckTableBuilder } = await load("tables.js");
+const { NeckRulebookBuilder } = await load("rulebooks.js");
 const { decodeCandidates, suppress } = await load("boxes.js");
 
 const TYPES = {
@@ -43,11 +43,11 @@ await compare("pillarize", "cells", pillars.cells);
 
 let headCells;
 if (pillar.neck === "sparse") {
-  const builder = new NeckTableBuilder(grid.ny, grid.nx, pillar.active_cells);
+  const builder = new NeckRulebookBuilder(grid.ny, grid.nx, pillar.active_cells);
   builder.build(Int32Array.from({ length: grid.ny * grid.nx }, (_, cell) => cell)); // a scan before this one
-  const tables = builder.build(pillars.cells);
-  for (const [name, table] of Object.entries(tables.inputs)) await compare("tables", name, table);
-  headCells = tables.headCells;
+  const rulebooks = builder.build(pillars.cells);
+  for (const [name, table] of Object.entries(rulebooks.inputs)) await compare("rulebooks", name, table);
+  headCells = rulebooks.headCells;
   await compare("neck_head", "cells", headCells);
 } else {
   const canvas = new Canvas(grid, pillar.channels, pillar.canvas);

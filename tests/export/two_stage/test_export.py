@@ -90,7 +90,7 @@ def test_a_sparse_neck_on_a_pooled_map_proposes(trained: tuple[Path, Path], tmp_
     assert (bundle.expected_input, bundle.expected_input_from) == (revolutions, "training")
     runtime = Detector(tmp_path / "bundle", score_threshold=0.0, threads=1)
     assert isinstance(runtime.pipeline, RefinePipeline)
-    assert runtime.pipeline.stages[2] == "tables" and len(runtime(SCANS[0])) > 0
+    assert runtime.pipeline.stages[2] == "rulebooks" and len(runtime(SCANS[0])) > 0
     golden = golden_stages(runtime.pipeline, SCANS[0])
     assert len(golden["neck+head"]["cells"]) == len(golden["neck+head"]["neck"])
     np.testing.assert_array_equal(golden["suppress"]["boxes"], runtime(SCANS[0]).boxes)

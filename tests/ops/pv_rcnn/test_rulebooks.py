@@ -11,8 +11,8 @@ from tests.ops.sparse.dense_volumes import at_cells, dense, random_cells
 SHAPE = (41, 18, 12)
 
 
-def by_table(features: np.ndarray, table: np.ndarray, weight: torch.Tensor) -> np.ndarray:
-    gathered = np.vstack([features, np.zeros((1, features.shape[1]))])[table]
+def by_rulebook(features: np.ndarray, rulebook: np.ndarray, weight: torch.Tensor) -> np.ndarray:
+    gathered = np.vstack([features, np.zeros((1, features.shape[1]))])[rulebook]
     return np.einsum("mkc,ock->mo", gathered, weight.flatten(2).numpy())
 
 
@@ -30,13 +30,13 @@ def test_every_level_is_the_dense_one(share: float) -> None:
                 weight = torch.randn(2, 2, *convolution.kernel, dtype=torch.float64)
                 volume = dense(features, levels[number - 1].cells, builder.maps[number - 1].shape)
                 volume = F.conv3d(volume, weight, stride=convolution.stride, padding=convolution.padding)
-                features = by_table(features, level.strided, weight)
+                features = by_rulebook(features, level.strided, weight)
                 np.testing.assert_allclose(features, at_cells(volume, level.cells), atol=1e-9)
                 assert float(volume.abs().sum()) == pytest.approx(np.abs(features).sum())  # nothing elsewhere
                 assert len(level.strided_back) == len(levels[number - 1].cells)
             if number < len(levels) - 1:
                 weight = torch.randn(2, 2, 3, 3, 3, dtype=torch.float64) / 5
                 volume = F.conv3d(dense(features, level.cells, builder.maps[number].shape), weight, padding=1)
-                features = by_table(features, level.same, weight)
+                features = by_rulebook(features, level.same, weight)
                 np.testing.assert_allclose(features, at_cells(volume, level.cells), atol=1e-9)
         assert levels[-1].same.shape == (0, SUBMANIFOLD.taps)

@@ -47,14 +47,14 @@ def test_a_convolution_by_table_is_the_dense_one(
                     stride=conv.stride, padding=conv.padding)  # fmt: skip
     np.testing.assert_array_equal(target.cells, np.flatnonzero(seen[0, 0].permute(1, 2, 0).reshape(-1) > 0))
 
-    table = target.rulebook(source, conv.inputs(target.shape, source.shape))
-    assert table.shape == (len(target), conv.taps) and table.dtype == np.int32
-    gathered = np.vstack([features, np.zeros((1, 3))])[table]  # (M, K, C)
+    rulebook = target.rulebook(source, conv.inputs(target.shape, source.shape))
+    assert rulebook.shape == (len(target), conv.taps) and rulebook.dtype == np.int32
+    gathered = np.vstack([features, np.zeros((1, 3))])[rulebook]  # (M, K, C)
     found = np.einsum("mkc,ock->mo", gathered, weight.reshape(4, 3, -1))
     np.testing.assert_allclose(found, at_cells(expected, target.cells), atol=1e-10)
 
     back = source.rulebook(target, conv.outputs(source.shape, target.shape))
-    forward = {(row, tap, i) for (row, tap), i in np.ndenumerate(table) if i < len(source)}
+    forward = {(row, tap, i) for (row, tap), i in np.ndenumerate(rulebook) if i < len(source)}
     assert forward == {(row, tap, i) for (i, tap), row in np.ndenumerate(back) if row < len(target)}
 
 

@@ -1,4 +1,4 @@
-// Cells of pillars -> the tables that a sparse neck reads (asca_pillars/ops/pillar/neck_rulebooks.py, docs/BUNDLE.md).
+// Cells of pillars -> the rulebooks that a sparse neck reads (asca_pillars/ops/pillar/neck_rulebooks.py, docs/BUNDLE.md).
 #pragma once
 
 #include <algorithm>
@@ -70,7 +70,7 @@ private:
 };
 
 // Int32 and row by row, as backbone.onnx takes them.
-struct NeckTables {
+struct NeckRulebooks {
     struct Level {
         std::vector<int32_t> strided, first, same;  // (M, 9), (N, 9), (N, 9)
         std::vector<int32_t> places;                // (head cells,)
@@ -79,20 +79,20 @@ struct NeckTables {
     std::vector<int32_t> head_cells;
 };
 
-// Builds the tables of scan after scan. Rows and columns of the map are multiples of 8; `fine` is the rule
+// Builds the rulebooks of scan after scan. Rows and columns of the map are multiples of 8; `fine` is the rule
 // (pillar.active_cells) by which the finest level grows, or else `sub`.
-class NeckTableBuilder {
+class NeckRulebookBuilder {
 public:
-    NeckTableBuilder(int64_t ny, int64_t nx, bool fine)
+    NeckRulebookBuilder(int64_t ny, int64_t nx, bool fine)
         : fine_(fine), pillars_(ny, nx), strided_{level(ny, nx, 1), level(ny, nx, 2), level(ny, nx, 3)},
           grown_(level(ny, nx, 1)), head_(level(ny, nx, 1)) {}
 
     // Of pillars at these cells, ascending; valid until the next scan.
-    const NeckTables& build(const std::vector<int64_t>& cells) {
+    const NeckRulebooks& build(const std::vector<int64_t>& cells) {
         activate(cells);
         const CellMap* before = &pillars_;
         for (int number = 0; number < 3; ++number) {
-            NeckTables::Level& found = tables_.levels[number];
+            NeckRulebooks::Level& found = rulebooks_.levels[number];
             const CellMap& output = outputs(number);
             gather(strided_[number], *before, 2, found.strided);
             gather(output, output, 1, found.same);
@@ -100,8 +100,8 @@ public:
             locate(output, number, found.places);
             before = &output;
         }
-        tables_.head_cells = head_.cells();
-        return tables_;
+        rulebooks_.head_cells = head_.cells();
+        return rulebooks_;
     }
 
 private:
@@ -141,10 +141,10 @@ private:
     }
 
     // The rows of `source` that a kernel of 3 with padding 1 reads for each of the outputs.
-    static void gather(const CellMap& outputs, const CellMap& source, int32_t stride, std::vector<int32_t>& table) {
-        table.resize(9 * static_cast<size_t>(outputs.size()));
+    static void gather(const CellMap& outputs, const CellMap& source, int32_t stride, std::vector<int32_t>& rulebook) {
+        rulebook.resize(9 * static_cast<size_t>(outputs.size()));
         outputs.visit([&](size_t i, int32_t y, int32_t x) {
-            int32_t* entry = &table[9 * i];
+            int32_t* entry = &rulebook[9 * i];
             for (int32_t row = stride * y - 1; row <= stride * y + 1; ++row)
                 for (int32_t column = stride * x - 1; column <= stride * x + 1; ++column)
                     *entry++ = source.row(row, column);
@@ -166,5 +166,5 @@ private:
     CellMap pillars_;
     std::array<CellMap, 3> strided_;
     CellMap grown_, head_;
-    NeckTables tables_;
+    NeckRulebooks rulebooks_;
 };

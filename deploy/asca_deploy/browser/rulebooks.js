@@ -1,4 +1,4 @@
-/** Cells of pillars -> the tables that a sparse neck reads (asca_pillars/ops/pillar/neck_rulebooks.py, docs/BUNDLE.md). */
+/** Cells of pillars -> the rulebooks that a sparse neck reads (asca_pillars/ops/pillar/neck_rulebooks.py, docs/BUNDLE.md). */
 
 const LEVELS = 3;
 
@@ -64,7 +64,7 @@ class CellMap {
   }
 }
 
-export class NeckTableBuilder {
+export class NeckRulebookBuilder {
   /**
    * @param {number} ny rows of the map, a multiple of 8
    * @param {number} nx columns, likewise
@@ -124,14 +124,14 @@ export class NeckTableBuilder {
 
 /** The rows of `source` that a kernel of 3 with padding 1 reads for each of the outputs: N x 9. */
 function gather(outputs, source, stride) {
-  const table = new Int32Array(9 * outputs.cells.length);
+  const rulebook = new Int32Array(9 * outputs.cells.length);
   outputs.visit((i, y, x) => {
     let entry = 9 * i;
     for (let row = stride * y - 1; row <= stride * y + 1; row++) {
-      for (let column = stride * x - 1; column <= stride * x + 1; column++) table[entry++] = source.row(row, column);
+      for (let column = stride * x - 1; column <= stride * x + 1; column++) rulebook[entry++] = source.row(row, column);
     }
   });
-  return table;
+  return rulebook;
 }
 
 /** Row of each head cell among the outputs of an upsampling, 4^halvings for each of the level's cells. */

@@ -1,4 +1,4 @@
-// build_tables NY NX RULE < scans: the tables of scan after scan by one builder, each array after its size.
+// build_rulebooks NY NX RULE < scans: the rulebooks of scan after scan by one builder, each array after its size.
 //
 // Int32 in and out. Of each scan its number of cells and the cells; out come, level by level, strided, first, same and
 // places, and then the head's cells.
@@ -8,7 +8,7 @@
 #include <string>
 #include <vector>
 
-#include "tables.hpp"
+#include "rulebooks.hpp"
 
 namespace {
 
@@ -21,13 +21,13 @@ void write(const std::vector<int32_t>& values) {
 }  // namespace
 
 int main(int, char** arguments) {
-    NeckTableBuilder builder(std::atoi(arguments[1]), std::atoi(arguments[2]), std::string(arguments[3]) == "fine");
+    NeckRulebookBuilder builder(std::atoi(arguments[1]), std::atoi(arguments[2]), std::string(arguments[3]) == "fine");
     for (int32_t count; std::fread(&count, sizeof count, 1, stdin) == 1;) {
         std::vector<int32_t> cells(count);
         if (std::fread(cells.data(), sizeof(int32_t), cells.size(), stdin) != cells.size()) return 1;
-        const NeckTables& tables = builder.build({cells.begin(), cells.end()});
-        for (const auto& level : tables.levels)
+        const NeckRulebooks& rulebooks = builder.build({cells.begin(), cells.end()});
+        for (const auto& level : rulebooks.levels)
             for (const auto* table : {&level.strided, &level.first, &level.same, &level.places}) write(*table);
-        write(tables.head_cells);
+        write(rulebooks.head_cells);
     }
 }
