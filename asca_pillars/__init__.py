@@ -5,8 +5,8 @@
     detections = Detector()(read_scan("scan.bin").points)
 
 The names below are the stable ones (docs/API.md). They are imported when they are first used, so that
-`import asca_pillars` costs nothing. PyTorch is imported when `train` or `export` is
-called, or `evaluate` with a checkpoint.
+`import asca_pillars` costs nothing. PyTorch is imported when `train` or `export` is called, or `evaluate` with a
+checkpoint.
 """
 
 import importlib

@@ -5,8 +5,8 @@
     python -m benchmarks.training_cost asca_sim --data data/sim
 
 Samples are drawn as in `asca train`, including augmentation and insertion, in one process; a step is forward,
-loss and backward on `--device`. Medians over the batches, with quartiles, in processor
-time (all threads together); for a step on a device other than a CPU in wall time.
+loss and backward on `--device`. Medians over the batches, with quartiles, in processor time (all threads
+together); for a step on a device other than a CPU in wall time.
 """
 
 import time

@@ -68,8 +68,7 @@ def train(
         data_root: a dataset's folder, see `data.open_split`.
         out: folder of this run; one run with the same config in it is resumed exactly. With the `step` schedule,
             and with `warmup_stable_decay` until its rate falls, it may be made longer by more `train.epochs`, and is
-            then what the longer run would have been. A run there
-            that has no checkpoint yet gives way.
+            then what the longer run would have been. A run there that has no checkpoint yet gives way.
         devices: number of devices on this machine, or `auto`.
         num_nodes: machines that train together, each started with the same command (torchrun, SLURM).
         init: checkpoint that a new run starts from, see `initial_weights`; a resumed run must have started from

@@ -3,6 +3,7 @@
 A box is given in the world and goes through the vehicle's pose at the scan's time into the sensor's frame, which is x
 right, y forward, z up (`axes: y-forward`). The sensor's height is that above the vehicle's frame, whose origin lies on
 the ground.
+
 Tables by their published schema, https://www.nuscenes.org/nuscenes#data-format: a rotation is a quaternion w, x, y, z,
 a size width, length, height. Categories of the detection task get its class names, others keep their own.
 """

@@ -125,10 +125,10 @@ class Inspection:
     """Measurements of `frames` of a split's frames.
 
     `types` counts the labels by type, including types of no class; `damaged` has a line for each selected frame that
-    cannot be read, `axes_warnings` a warning for each scan whose axes look wrong. A
-    dataset of KITTI's layout cannot state its mounting (`states_mounting`). `conventions` states how well the
-    points fit the boxes of the classes as labelled, turned, mirrored, raised and lowered; `yaws_doubt` is a
-    sentence if the yaws do not look like radians.
+    cannot be read, `axes_warnings` a warning for each scan whose axes look wrong. A dataset of
+    KITTI's layout cannot state its mounting (`states_mounting`). `conventions` states how well the points fit the boxes
+    of the classes as labelled, turned, mirrored, raised and lowered; `yaws_doubt` is a sentence if the yaws do not look
+    like radians.
     """
 
     data: str

@@ -16,9 +16,8 @@ This differs from KITTI's AP, which ranks by score over the whole set: there eac
 object matched to a low detection (of any class) is neither found nor missed, DontCare areas apply in 2D only, and
 objects outside a distance band are ignored.
 
-Recall in 3D at
-easy, moderate and hard is reported in Table 2 of AV PV-RCNN (2023), without a score. A distance band keeps the
-counted objects in it for the recall and the detections in it for the precision; it changes no match.
+Recall in 3D at easy, moderate and hard is reported in Table 2 of AV PV-RCNN (2023), without a score. A distance band
+keeps the counted objects in it for the recall and the detections in it for the precision; it changes no match.
 """
 
 from collections.abc import Mapping, Sequence

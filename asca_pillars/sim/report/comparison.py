@@ -151,9 +151,8 @@ class Row:
         measure: meaning of `value`: simulated / real, simulated - real, or the Jensen-Shannon distance.
         bar: tolerance: largest deviation of a ratio from 1 or a difference from 0, or largest distance; None if the row
             is for information.
-        noise: noise, where known: the standard error of a ratio or a difference; the
-            expected distance of as few objects (or scans) as for the real reflectances, or of as few labels as in
-            this set.
+        noise: noise, where known: the standard error of a ratio or a difference; the expected distance of as few
+            objects (or scans) as for the real reflectances, or of as few labels as in this set.
         noise_of_points: the expected distance of as many independent points as there are real reflectances.
     """
 

@@ -76,8 +76,8 @@ def reliability(offered: Sequence[str], qos: Qos) -> Literal["best_effort", "rel
     """Return the reliability to subscribe with; None if it depends on publishers and there are none yet.
 
     A reliable subscription gets nothing of a best-effort publisher. A best-effort subscription gets messages of both,
-    but loses each one that lacks a fragment, as clouds larger than the middleware's buffers do.
-    So the subscription is reliable where all publishers are.
+    but loses each one that lacks a fragment, as clouds larger than the middleware's buffers do. So
+    the subscription is reliable where all publishers are.
 
     Args:
         offered: by each publisher, "reliable" or "best_effort".
