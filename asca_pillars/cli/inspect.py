@@ -1,5 +1,6 @@
 """`asca inspect`: inspection of a dataset before training, or of scans without labels before detection."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -12,6 +13,7 @@ from asca_pillars.cli.options import (
     BundleOption,
     ColumnsOption,
     JsonOption,
+    OverridesOption,
     PoseOption,
     ReflectanceScaleOption,
     SensorHeightOption,
@@ -38,6 +40,7 @@ def inspect(
             rich_help_panel="Input",
         ),
     ] = None,
+    override: OverridesOption = None,
     split: Annotated[
         str | None,
         typer.Option(
@@ -117,14 +120,22 @@ def inspect(
         "--columns": columns,
         "--topic": topic,
     }
-    of_labels = {"--split": split, "--propose": propose, "--draw": draw, "--out": out}
+    of_labels = {
+        "--set": " ".join(override or ()) or None,
+        "--split": split,
+        "--propose": propose,
+        "--draw": draw,
+        "--out": out,
+    }
     if config is not None:
         if is_recording(data):
             raise ConfigError(f"{data}: is a recording, and --config {config} for datasets with labels; leave it out")
         for name, value in of_scans.items():
             if value is not None:
                 raise ConfigError(f"{name}: is for scans without labels, and --config for datasets; leave one out")
-        _inspect_dataset(data, config, split=split, frames=frames, propose=propose, draw=draw, out=out, json=json)
+        _inspect_dataset(
+            data, config, override or (), split=split, frames=frames, propose=propose, draw=draw, out=out, json=json
+        )
         return
     for name, value in of_labels.items():
         if value is not None:
@@ -175,6 +186,7 @@ def _inspect_scans(data: Path, json: Path | None, **options: Any) -> None:
 def _inspect_dataset(
     data: Path,
     config: Path,
+    override: Sequence[str],
     *,
     split: str | None,
     frames: int,
@@ -208,7 +220,7 @@ def _inspect_dataset(
     pictures = Path("inspection") if out is None else out
     if draw is not None:
         require_replaceable_pictures(pictures)
-    settings = load_config(config)
+    settings = load_config(config, override)
     console = Console(markup=False, highlight=False)
     frames_of = open_split(data, settings.data.train_set if split is None else split)
     if settings.model.kind == "pillar_refine":

@@ -117,7 +117,7 @@ def test_what_is_printed_and_written(folder: Path) -> None:
         ),
         *(
             (f"{{scans}} {option}", f"{option}: is for a dataset with labels; give --config")
-            for option in ("--split val", "--propose own.yaml", "--draw 2", "--out pictures")
+            for option in ("--set train.epochs=2", "--split val", "--propose own.yaml", "--draw 2", "--out pictures")
         ),
         ("{scans}/0.npy --topic /lidar", "--topic /lidar: is for recordings"),
         ("{odd}", "several topics hold scans, give --topic: /lidar"),

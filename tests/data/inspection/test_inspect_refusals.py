@@ -72,6 +72,13 @@ def test_the_tables_come_before_the_refusal(data: Path, tmp_path: Path, capsys: 
     assert [item["boxes"] for item in report["classes"]] == [2 * FRAMES, FRAMES, 0]
 
 
+def test_overrides_win_over_the_configuration(data: Path, tmp_path: Path) -> None:
+    config = tmp_path / "config.yaml"
+    config.write_text(yaml.safe_dump(to_dict(CONFIG)))
+    with pytest.raises(DatasetError, match=r"have fewer points than data\.min_points = 100000"):
+        inspect(data, config=config, override=["data.min_points=100000"], frames=2)
+
+
 def test_what_is_missing_in_a_sample_or_beside_it_is_named(data: Path) -> None:
     for frame_id in ("000000", "000006"):
         path = KittiSplit(data).label_path(frame_id)
