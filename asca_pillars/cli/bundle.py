@@ -61,10 +61,13 @@ def verify(bundle: _BundleArgument = None) -> None:
 
     Example: asca bundle verify my_bundle/
     """
+    import logging
+
     from asca_deploy import Detector
     from asca_deploy.shipped import find_bundle, sample_scan_path
     from asca_pillars.scans.scan_reader import read_scan
 
+    logging.getLogger("asca_pillars").setLevel(logging.ERROR)  # the sample need not be like the scans of its training
     folder = find_bundle(bundle)
     detector = Detector(folder)  # compares hashes, metadata and shapes
     detections = detector(read_scan(sample_scan_path()).points)
