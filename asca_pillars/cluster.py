@@ -75,8 +75,8 @@ class ShardFolder:
             write_json(path, {"shard_size": shard_size, "settings": settings})
             return shard_size
         try:
-            begun = json.loads(path.read_text(encoding="utf-8"))
-            stored, size = {**begun["settings"]}, int(begun["shard_size"])
+            earlier = json.loads(path.read_text(encoding="utf-8"))
+            stored, size = {**earlier["settings"]}, int(earlier["shard_size"])
         except (ValueError, KeyError, TypeError):
             raise OutputError(f"{path}: is damaged; choose another folder, or delete {self.path}") from None
         for name in {**settings, **stored}:

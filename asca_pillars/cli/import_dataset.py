@@ -111,7 +111,7 @@ def import_dataset(
     counts = write_imported(out, imported, val_share)
     boxes = ", ".join(f"{name} {count}" for name, count in counts.boxes.items()) or "none"
     console.print(f"{out}: {counts.train} frames to train on, {counts.val} to validate; boxes: {boxes}", soft_wrap=True)
-    for line in (*imported.left_out.lines(), *([counts.doubt] if counts.doubt else [])):
+    for line in (*imported.skipped.lines(), *([counts.doubt] if counts.doubt else [])):
         console.print(printable(line), style="yellow", soft_wrap=True)
     console.print(f"Next: asca inspect {out} -c asca_small_sim --propose own.yaml", soft_wrap=True)
 

@@ -112,11 +112,11 @@ def _train(
     config = replace(config, data=replace(config.data, camera_view=view))
     recover(checkpoints)
     resumed, damage = checkpoint_to_resume(checkpoints, config.model)
-    goes_on = resumed is not None
-    config = replace(config, train=_with_resolved_precision(config.train, out, resumes=goes_on))
+    resumes = resumed is not None
+    config = replace(config, train=_with_resolved_precision(config.train, out, resumes=resumes))
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
     # Arguments are checked before minutes of work, and before the folder is claimed for this run.
-    weights = None if goes_on and init is None else initial_weights(config, init)
+    weights = None if resumes and init is None else initial_weights(config, init)
     distillation = Distillation(config, config.train.teacher) if config.train.teacher else None
     files = AtomicCheckpointIO(keep_last=damage is None)
     last = LastCheckpoint(checkpoints, config.train.checkpoint_steps)
@@ -133,16 +133,16 @@ def _train(
     data = DetectionData(config, data_root, reporter)
     inputs = TrainingInputs.of(data.training_set.frames.split, trainer.world_size, weights)
     prepare_run_folder(out, config, inputs, steps_of(resumed))
-    if damage is not None and goes_on:
+    if damage is not None and resumes:
         reporter.remark(f"{damage}: resuming from {resumed}")
     if config.train.precision == "bf16" and not has_bfloat16():
-        remedy = f"resume where {out} was started, or start anew with --init" if goes_on else "choose auto or fp32"
+        remedy = f"resume where {out} was started, or start anew with --init" if resumes else "choose auto or fp32"
         reporter.remark(f"train.precision = bf16: this device has no bfloat16 and is many times slower in it; {remedy}")
     L.seed_everything(config.train.seed, verbose=False)
-    keep = goes_on or not trainer.is_global_zero  # else it may be of scans that were there before
+    keep = resumes or not trainer.is_global_zero  # else it may be of scans that were there before
     measured = measure_input(out, data.training_set.frames, keep=keep, reporter=reporter)
     module = DetectionModule(config, measured, distillation)
-    if weights and not goes_on:
+    if weights and not resumes:
         module.detector.load_state_dict(module.detector.state_dict() | weights)
     with warnings.catch_warnings(), interrupt.listening():
         # Warnings of torch and Lightning about each other.
@@ -155,7 +155,7 @@ def _train(
         # Advice on workers and logging that does not fit two cores and small data.
         warnings.filterwarnings("ignore", category=PossibleUserWarning)
         try:
-            trainer.fit(module, data, ckpt_path=str(resumed) if goes_on else None, weights_only=True)
+            trainer.fit(module, data, ckpt_path=str(resumed) if resumes else None, weights_only=True)
         finally:  # a run that was stopped has weights to take elsewhere, too
             if trainer.is_global_zero and (checkpoints / LAST).is_file():
                 save_weights(checkpoints / LAST, checkpoints / WEIGHTS_FILE)

@@ -38,15 +38,15 @@ def read_argoverse2(root: Path, reporter: Reporter = SILENT) -> Imported:
     logs = sorted(path.parent for path in files_below(root) if path.name == "annotations.feather")
     if not logs:
         raise DatasetError(f"{root}: no annotations.feather below; give a folder of Argoverse 2 logs")
-    left_out = SkippedEntries()
-    frames = [frame for log in reporter.track(logs, "Reading logs") for frame in _frames(log, left_out)]
+    skipped = SkippedEntries()
+    frames = [frame for log in reporter.track(logs, "Reading logs") for frame in _frames(log, skipped)]
     settings = BoxDataset(
         sensor_height=AXLE_HEIGHT_M, reflectance_scale=255.0, scans=str(root), sensor_position=SENSOR_POSITION_M
     )
-    return Imported(settings, frames, left_out)
+    return Imported(settings, frames, skipped)
 
 
-def _frames(log: Path, left_out: SkippedEntries) -> list[ImportedFrame]:
+def _frames(log: Path, skipped: SkippedEntries) -> list[ImportedFrame]:
     path = log / "annotations.feather"
     numbers = ("timestamp_ns", *_CENTER, *_SIZE, *_TURN)
     table = feather_table(path, numbers, ("track_uuid", "category"), DatasetError)
@@ -69,7 +69,7 @@ def _frames(log: Path, left_out: SkippedEntries) -> list[ImportedFrame]:
             kept[int(stamps[row])].append(row)
         except ValueError as reason:
             kept[int(stamps[row])]  # the sweep is kept
-            left_out.add("boxes", f"{path}, row {row}", reason)
+            skipped.add("boxes", f"{path}, row {row}", reason)
     frames = []
     for stamp, rows in sorted(kept.items()):
         folders = (log / "sensors" / "lidar", log / "lidar")

@@ -130,7 +130,7 @@ class Imported(NamedTuple):
 
     settings: BoxDataset
     frames: Sequence[ImportedFrame]
-    left_out: SkippedEntries
+    skipped: SkippedEntries
 
 
 class ImportCounts(NamedTuple):
@@ -150,7 +150,7 @@ def drop_unwritable(imported: Imported) -> Imported:
     Raises:
         DatasetError: no frame remains, or no box is usable.
     """
-    scans, left_out = Path(imported.settings.scans), imported.left_out
+    scans, skipped = Path(imported.settings.scans), imported.skipped
     frames: dict[str, ImportedFrame] = {}
     boxes = 0
     for frame in imported.frames:
@@ -160,14 +160,14 @@ def drop_unwritable(imported: Imported) -> Imported:
                 raise ValueError(f"{frames[frame_id].scan.name} is the same frame")
             text_of(frame.recording, "the recording")
         except ValueError as reason:
-            left_out.add("frames", frame.scan, reason)
+            skipped.add("frames", frame.scan, reason)
             continue
         time_s = frame.time_s if frame.time_s is not None and math.isfinite(frame.time_s) else None
-        records = _usable_records(frame, left_out)
+        records = _usable_records(frame, skipped)
         boxes += len(records.types)
         frames[frame_id] = frame._replace(records=records, time_s=time_s)
-    if not frames or (not boxes and left_out.counts.keys() - {"frames"}):
-        first = next(iter(left_out.lines()), "give the folder that holds the recordings")
+    if not frames or (not boxes and skipped.counts.keys() - {"frames"}):
+        first = next(iter(skipped.lines()), "give the folder that holds the recordings")
         raise DatasetError(f"{scans}: no {'box' if frames else 'labelled scan'} there that can be used; {first}")
     return imported._replace(frames=list(frames.values()))
 
@@ -185,7 +185,7 @@ def _readable_id(frame: ImportedFrame, scans: Path) -> str:
     return frame_id
 
 
-def _usable_records(frame: ImportedFrame, left_out: SkippedEntries) -> BoxRecords:
+def _usable_records(frame: ImportedFrame, skipped: SkippedEntries) -> BoxRecords:
     boxes, types, scores, track_ids = frame.records
     kept: dict[int, str] = {}
     for row, (kind, can) in enumerate(zip(types, can_be_written(boxes), strict=True)):
@@ -196,7 +196,7 @@ def _usable_records(frame: ImportedFrame, left_out: SkippedEntries) -> BoxRecord
                 raise ValueError(f"no box of a {name} has the center, size and yaw {numbers}")
             kept[row] = name
         except ValueError as reason:
-            left_out.add("boxes", frame.scan, reason)
+            skipped.add("boxes", frame.scan, reason)
     rows = list(kept)
     tracks = [None if track_ids[row] is None else str(track_ids[row]) for row in rows]
     return records_from(boxes[rows], list(kept.values()), scores[rows], tracks)

@@ -44,13 +44,13 @@ def read_kitti_raw(root: Path, reporter: Reporter = SILENT) -> Imported:
     drives = sorted(path.parent for path in files_below(root.resolve()) if path.name == LABELS)
     if not drives:
         raise DatasetError(f"{root}: no {LABELS} below; give a folder of KITTI's drives, with their tracklets")
-    left_out = SkippedEntries()
-    frames = [frame for drive in reporter.track(drives, "Reading drives") for frame in _frames(drive, left_out)]
-    return Imported(BoxDataset(scans=str(root.resolve()), labeled_view_deg=LABELED_VIEW_DEG), frames, left_out)
+    skipped = SkippedEntries()
+    frames = [frame for drive in reporter.track(drives, "Reading drives") for frame in _frames(drive, skipped)]
+    return Imported(BoxDataset(scans=str(root.resolve()), labeled_view_deg=LABELED_VIEW_DEG), frames, skipped)
 
 
-def _frames(drive: Path, left_out: SkippedEntries) -> list[ImportedFrame]:
-    labels = _read_tracklets(drive / LABELS, left_out)
+def _frames(drive: Path, skipped: SkippedEntries) -> list[ImportedFrame]:
+    labels = _read_tracklets(drive / LABELS, skipped)
     frames = []
     for scan in visible_files(drive / "velodyne_points" / "data", "*.bin"):
         frame_labels = labels.get(int(scan.stem) if scan.stem.isdecimal() else -1, _Labels([], [], []))
@@ -61,7 +61,7 @@ def _frames(drive: Path, left_out: SkippedEntries) -> list[ImportedFrame]:
     return frames
 
 
-def _read_tracklets(path: Path, left_out: SkippedEntries) -> dict[int, _Labels]:
+def _read_tracklets(path: Path, skipped: SkippedEntries) -> dict[int, _Labels]:
     """Read the labels of each frame."""
     labels: dict[int, _Labels] = defaultdict(lambda: _Labels([], [], []))
     try:
@@ -75,14 +75,14 @@ def _read_tracklets(path: Path, left_out: SkippedEntries) -> dict[int, _Labels]:
         raise DatasetError(f"{path}: not a KITTI tracklet file ({error}); download the file again") from None
     for number, tracklet in enumerate(tracklets):
         try:
-            _add(labels, number, tracklet, left_out, path)
+            _add(labels, number, tracklet, skipped, path)
         except ValueError as reason:
-            left_out.add("tracklets", f"{path}, tracklet {number}", reason)
+            skipped.add("tracklets", f"{path}, tracklet {number}", reason)
     return dict(labels)
 
 
 def _add(
-    labels: dict[int, _Labels], number: int, tracklet: ElementTree.Element, left_out: SkippedEntries, path: Path
+    labels: dict[int, _Labels], number: int, tracklet: ElementTree.Element, skipped: SkippedEntries, path: Path
 ) -> None:
     """Add the boxes of a tracklet to their frames; ValueError if it has no type, size or first frame."""
     height, width, length = _numbers(tracklet, "hwl")
@@ -94,7 +94,7 @@ def _add(
         try:
             x, y, bottom, yaw = _numbers(pose, ("tx", "ty", "tz", "rz"))
         except ValueError as reason:
-            left_out.add("boxes", f"{path}, tracklet {number}, pose {offset}", reason)
+            skipped.add("boxes", f"{path}, tracklet {number}, pose {offset}", reason)
             continue
         frame_labels = labels[first + offset]
         frame_labels.boxes.append([x, y, bottom + height / 2, length, width, height, yaw])

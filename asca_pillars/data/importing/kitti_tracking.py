@@ -39,17 +39,17 @@ def read_kitti_tracking(root: Path, reporter: Reporter = SILENT) -> Imported:
     labels = visible_files(folder / "label_02", "*.txt")
     if not labels:
         raise DatasetError(f"{folder}: no label_02/*.txt there; give the folder of KITTI's tracking benchmark")
-    left_out = SkippedEntries()
+    skipped = SkippedEntries()
     bar = reporter.track(labels, "Reading sequences")
-    frames = [frame for path in bar for frame in _frames(folder.resolve(), path, left_out)]
+    frames = [frame for path in bar for frame in _frames(folder.resolve(), path, skipped)]
     settings = BoxDataset(scans=str(folder.resolve() / "velodyne"), labeled_view_deg=LABELED_VIEW_DEG)
-    return Imported(settings, frames, left_out)
+    return Imported(settings, frames, skipped)
 
 
-def _frames(folder: Path, labels: Path, left_out: SkippedEntries) -> list[ImportedFrame]:
+def _frames(folder: Path, labels: Path, skipped: SkippedEntries) -> list[ImportedFrame]:
     sequence = labels.stem
     calibration = read_calibration(folder / "calib" / f"{sequence}.txt")
-    tracked = _read_tracked(labels, left_out)
+    tracked = _read_tracked(labels, skipped)
     frames = []
     for scan in visible_files(folder / "velodyne" / sequence, "*.bin"):
         number = int(scan.stem) if scan.stem.isdecimal() else -1
@@ -66,7 +66,7 @@ def _records(tracked: list[_Tracked], calibration: Calibration) -> BoxRecords:
     )
 
 
-def _read_tracked(path: Path, left_out: SkippedEntries) -> dict[int, list[_Tracked]]:
+def _read_tracked(path: Path, skipped: SkippedEntries) -> dict[int, list[_Tracked]]:
     """Read the objects of each frame with their track numbers."""
     try:
         lines = read_text(path, DatasetError, errors="replace").splitlines()
@@ -78,10 +78,10 @@ def _read_tracked(path: Path, left_out: SkippedEntries) -> dict[int, list[_Track
         if not words:
             continue
         if len(words) < 2 or not (words[0].isdecimal() and len(words[0]) < _LONGEST_FRAME):
-            left_out.add("lines", f"{path}:{number}", "does not begin with a frame's number")
+            skipped.add("lines", f"{path}:{number}", "does not begin with a frame's number")
             continue
         try:
             tracked[int(words[0])].append((parse_object(words[2:], f"{path}:{number}"), words[1]))
         except DatasetError as error:
-            left_out.add("lines", path, error)
+            skipped.add("lines", path, error)
     return dict(tracked)

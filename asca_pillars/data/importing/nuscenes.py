@@ -60,14 +60,14 @@ def read_nuscenes(root: Path, reporter: Reporter = SILENT) -> Imported:
     """
     tables = _tables_folder(root)
     data = tables.absolute().parent.resolve()
-    left_out = SkippedEntries()
+    skipped = SkippedEntries()
     names = ("sensor", "calibrated_sensor", "ego_pose", "sample", "scene", "category", "instance", "sample_annotation")
-    read = {name: _table(tables, name, left_out) for name in (*names, "sample_data")}
-    frames = _frames(read, tables, data, left_out, reporter)
+    read = {name: _table(tables, name, skipped) for name in (*names, "sample_data")}
+    frames = _frames(read, tables, data, skipped, reporter)
     settings = BoxDataset(
         sensor_height=_sensor_height_m(read), axes="y-forward", reflectance_scale=255.0, columns=5, scans=str(data)
     )
-    return Imported(settings, frames, left_out)
+    return Imported(settings, frames, skipped)
 
 
 def _sensor_height_m(tables: Mapping[str, _Table]) -> float | None:
@@ -81,14 +81,14 @@ def _sensor_height_m(tables: Mapping[str, _Table]) -> float | None:
 
 
 def _frames(
-    tables: Mapping[str, _Table], folder: Path, data: Path, left_out: SkippedEntries, reporter: Reporter
+    tables: Mapping[str, _Table], folder: Path, data: Path, skipped: SkippedEntries, reporter: Reporter
 ) -> list[ImportedFrame]:
     labels: dict[str, list[_Row]] = {}
     for token, row in tables["sample_annotation"].items():
         try:
             labels.setdefault(text_of(entry(row, "sample_token"), "sample_token"), []).append(row)
         except ValueError as reason:
-            left_out.add("boxes", f"{folder}/sample_annotation.json, {token}", reason)
+            skipped.add("boxes", f"{folder}/sample_annotation.json, {token}", reason)
     frames = []
     for token, row in reporter.track(tables["sample_data"].items(), "Reading frames"):
         try:
@@ -105,9 +105,9 @@ def _frames(
                 raise ValueError(f"filename is {str(filename)[:80]!r}, not a file below {data}")
             changes = [_change(frame) for frame in (_linked(row, "ego_pose", tables), sensor)]
             annotations = labels.get(row["sample_token"], [])
-            frames.append(ImportedFrame(scan, _records(annotations, changes, tables, folder, left_out), scene))
+            frames.append(ImportedFrame(scan, _records(annotations, changes, tables, folder, skipped), scene))
         except ValueError as reason:
-            left_out.add("frames", f"{folder}/sample_data.json, {token}", reason)
+            skipped.add("frames", f"{folder}/sample_data.json, {token}", reason)
     return frames
 
 
@@ -116,7 +116,7 @@ def _records(
     changes: list[tuple[_Doubles, _Doubles]],
     tables: Mapping[str, _Table],
     folder: Path,
-    left_out: SkippedEntries,
+    skipped: SkippedEntries,
 ) -> BoxRecords:
     boxes, types, tracks = [], [], []
     for label in labels:
@@ -129,7 +129,7 @@ def _records(
                 entry(_linked(_linked(label, "instance", tables), "category", tables), "name"), "the category"
             )
         except ValueError as reason:
-            left_out.add("boxes", f"{folder}/sample_annotation.json, {label['token']}", reason)
+            skipped.add("boxes", f"{folder}/sample_annotation.json, {label['token']}", reason)
             continue
         boxes.append([*center, length, width, height, np.arctan2(turn[1, 0], turn[0, 0])])
         types.append(DETECTION_CLASSES.get(kind, kind))
@@ -167,7 +167,7 @@ def _tables_folder(root: Path) -> Path:
     return folders[0]
 
 
-def _table(folder: Path, name: str, left_out: SkippedEntries) -> _Table:
+def _table(folder: Path, name: str, skipped: SkippedEntries) -> _Table:
     """Read the rows of a table by their tokens."""
     path = folder / f"{name}.json"
     try:
@@ -183,5 +183,5 @@ def _table(folder: Path, name: str, left_out: SkippedEntries) -> _Table:
         try:
             table[text_of(entry(row, "token"), "token")] = row
         except ValueError as reason:
-            left_out.add("rows", f"{path}, row {number}", reason)
+            skipped.add("rows", f"{path}, row {number}", reason)
     return table

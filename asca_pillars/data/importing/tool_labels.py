@@ -116,13 +116,13 @@ def read_tool_labels(
     scan_of = _scans_by_name(Path(dataset.scans))
     paths = [source] if source.is_file() else sorted(files_below(source), key=natural_order)
     root = source.parent if source.is_file() else source
-    left_out, frames = SkippedEntries(), []
+    skipped, frames = SkippedEntries(), []
     for path in paths:
         relative = path.relative_to(root)
         if path.suffix.lower() != suffix or is_hidden(relative) or path.name in left or path.name.startswith("_"):
             continue
         try:
-            records = _records(parse(read_text(path, DatasetError)), path, left_out)
+            records = _records(parse(read_text(path, DatasetError)), path, skipped)
         except UnicodeDecodeError:
             raise DatasetError(f"{path}: not UTF-8 text; export the labels again") from None
         except (ValueError, RecursionError) as reason:
@@ -132,7 +132,7 @@ def read_tool_labels(
         frames.append(ImportedFrame(scan, records, recording))
     if not frames:
         raise DatasetError(f"{source}: no *{suffix} with labels there; give the folder that the tool writes them to")
-    return Imported(dataset, frames, left_out)
+    return Imported(dataset, frames, skipped)
 
 
 def json_of(text: str) -> Any:
@@ -226,7 +226,7 @@ def _written(out: Path) -> dict[str, dict[str, list[str]]]:
     return json.loads(path.read_text(encoding="utf-8")) if path.exists() and path.stat().st_size else {}
 
 
-def _records(boxes: Iterable[ToolBox], path: Path, left_out: SkippedEntries) -> BoxRecords:
+def _records(boxes: Iterable[ToolBox], path: Path, skipped: SkippedEntries) -> BoxRecords:
     rows, types, tracks = [], [], []
     for number, box in enumerate(boxes, start=1):
         try:
@@ -238,7 +238,7 @@ def _records(boxes: Iterable[ToolBox], path: Path, left_out: SkippedEntries) -> 
         if (why := yaw_error(box.yaw)) is not None:
             raise ValueError(f"box {number}: the yaw {why}")
         if box.tilt > _UPRIGHT_RAD:
-            left_out.add("tilts", f"{path}, box {number}", f"rolled or pitched by {box.tilt:.2g} rad, read upright")
+            skipped.add("tilts", f"{path}, box {number}", f"rolled or pitched by {box.tilt:.2g} rad, read upright")
         rows.append([*center, *size, box.yaw])
         tracks.append(box.track_id)
     array = np.array(rows, np.float64).reshape(-1, 7)

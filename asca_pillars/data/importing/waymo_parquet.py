@@ -141,34 +141,34 @@ def read_waymo(root: Path, out: Path, reporter: Reporter = SILENT) -> Imported:
     if not (out / DATASET_FILE).exists():
         # Written first, so that an interrupted import can be repeated.
         write_text(out / DATASET_FILE, MARKER)
-    scans, left_out = out.resolve() / "scans", SkippedEntries()
+    scans, skipped = out.resolve() / "scans", SkippedEntries()
     frames: list[ImportedFrame] = []
     for path in reporter.track(segments, "Reading segments"):
-        labels = _labels(root / "lidar_box" / path.name, left_out)
+        labels = _labels(root / "lidar_box" / path.name, skipped)
         nothing = records_from(np.zeros((0, 7)), ())
         folder = scans / portable_name(path.stem)
-        times = _write_scans(root, path, folder, left_out)
+        times = _write_scans(root, path, folder, skipped)
         frames += [ImportedFrame(_scan_path(folder, time), labels.get(time, nothing), path.stem) for time in times]
     top = _calibrations(root / "lidar_calibration" / segments[0].name, SkippedEntries()).get(TOP)
     x, y, z = np.zeros(3) if top is None else np.round(top.vehicle_from_lidar[:3, 3], 3).tolist()
     settings = BoxDataset(sensor_height=0.0, reflectance_scale=1.0, scans=str(scans), sensor_position=(x, y, z))
-    return Imported(settings, frames, left_out)
+    return Imported(settings, frames, skipped)
 
 
 def _scan_path(folder: Path, time: int) -> Path:
     return folder / f"{portable_name(str(time))}.npy"
 
 
-def _write_scans(root: Path, lidar: Path, folder: Path, left_out: SkippedEntries) -> list[int]:
+def _write_scans(root: Path, lidar: Path, folder: Path, skipped: SkippedEntries) -> list[int]:
     """Write the scans of a segment that are not there yet; the times of all that are there then."""
-    missing = _images_of_times(lidar, left_out)
+    missing = _images_of_times(lidar, skipped)
     times = sorted(missing)
     missing = Counter({time: rows for time, rows in missing.items() if not _scan_path(folder, time).exists()})
     if not missing:
         return times
-    calibrations = _calibrations(root / "lidar_calibration" / lidar.name, left_out)
-    vehicle_poses = _vehicle_poses(root / "vehicle_pose" / lidar.name, left_out)
-    pixel_poses = _pixel_poses(root / "lidar_pose" / lidar.name, left_out) if vehicle_poses else iter(())
+    calibrations = _calibrations(root / "lidar_calibration" / lidar.name, skipped)
+    vehicle_poses = _vehicle_poses(root / "vehicle_pose" / lidar.name, skipped)
+    pixel_poses = _pixel_poses(root / "lidar_pose" / lidar.name, skipped) if vehicle_poses else iter(())
     early: dict[int, NDArray[np.float32]] = {}
     points: dict[int, list[NDArray[np.float32]]] = defaultdict(list)
     columns = (_TIME, _LASER, *(f"{image}.{part}" for image in _IMAGES for part in ("values", "shape")))
@@ -184,7 +184,7 @@ def _write_scans(root: Path, lidar: Path, folder: Path, left_out: SkippedEntries
         try:
             points[time] += _points(row, calibrations, poses, vehicle_poses.get(time))
         except ValueError as reason:  # a scan without one of its sensors would look complete
-            left_out.add("frames", f"{lidar}, row {number}", reason)
+            skipped.add("frames", f"{lidar}, row {number}", reason)
             del missing[time], points[time]
             times.remove(time)
             continue
@@ -195,14 +195,14 @@ def _write_scans(root: Path, lidar: Path, folder: Path, left_out: SkippedEntries
     return times
 
 
-def _images_of_times(lidar: Path, left_out: SkippedEntries) -> Counter[int]:
+def _images_of_times(lidar: Path, skipped: SkippedEntries) -> Counter[int]:
     """Return the number of rows, one for each sensor, of each frame of a segment."""
     rows: Counter[int] = Counter()
     for number, row in enumerate(_parquet_rows(lidar, (_TIME,))):
         try:
             rows[whole_number(row[_TIME], _TIME)] += 1
         except ValueError as reason:
-            left_out.add("range images", f"{lidar}, row {number}", reason)
+            skipped.add("range images", f"{lidar}, row {number}", reason)
     return rows
 
 
@@ -224,7 +224,7 @@ def _points(
     ]
 
 
-def _labels(path: Path, left_out: SkippedEntries) -> dict[int, BoxRecords]:
+def _labels(path: Path, skipped: SkippedEntries) -> dict[int, BoxRecords]:
     """Read the boxes of each frame."""
     boxes: dict[int, list[NDArray[np.float64]]] = defaultdict(list)
     types: dict[int, list[str]] = defaultdict(list)
@@ -236,7 +236,7 @@ def _labels(path: Path, left_out: SkippedEntries) -> dict[int, BoxRecords]:
             box = numbers([row[name] for name in _BOX_COLUMNS], 7, "the box")
             identity = None if row[_OBJECT] is None else text_of(row[_OBJECT], _OBJECT)
         except ValueError as reason:
-            left_out.add("boxes", f"{path}, row {number}", reason)
+            skipped.add("boxes", f"{path}, row {number}", reason)
             continue
         boxes[time].append(box)
         types[time].append(TYPES.get(kind, "Unknown"))
@@ -244,7 +244,7 @@ def _labels(path: Path, left_out: SkippedEntries) -> dict[int, BoxRecords]:
     return {time: records_from(np.array(rows), types[time], None, objects[time]) for time, rows in boxes.items()}
 
 
-def _calibrations(path: Path, left_out: SkippedEntries) -> dict[int, LidarCalibration]:
+def _calibrations(path: Path, skipped: SkippedEntries) -> dict[int, LidarCalibration]:
     """Read the calibration of each sensor, by its number."""
     columns = (_LASER, _EXTRINSIC, *(f"{_INCLINATION}.{part}" for part in ("values", "min", "max")))
     calibrations = {}
@@ -261,7 +261,7 @@ def _calibrations(path: Path, left_out: SkippedEntries) -> dict[int, LidarCalibr
                 highest,
             )
         except ValueError as reason:
-            left_out.add("calibrations", f"{path}, row {number}", reason)
+            skipped.add("calibrations", f"{path}, row {number}", reason)
     return calibrations
 
 
@@ -273,18 +273,18 @@ def _rigid(values: Any, name: str) -> Doubles:
     return matrix
 
 
-def _vehicle_poses(path: Path, left_out: SkippedEntries) -> dict[int, Doubles]:
+def _vehicle_poses(path: Path, skipped: SkippedEntries) -> dict[int, Doubles]:
     """Read the transform (4, 4) of each frame from the vehicle to the world; empty if it was not downloaded."""
     poses: dict[int, Doubles] = {}
     for number, row in enumerate(_parquet_rows(path, (_TIME, _VEHICLE_POSE)) if path.is_file() else ()):
         try:
             poses[whole_number(row[_TIME], _TIME)] = _rigid(row[_VEHICLE_POSE], _VEHICLE_POSE)
         except ValueError as reason:
-            left_out.add("poses", f"{path}, row {number}", reason)
+            skipped.add("poses", f"{path}, row {number}", reason)
     return poses
 
 
-def _pixel_poses(path: Path, left_out: SkippedEntries) -> Iterator[tuple[int, NDArray[np.float32]]]:
+def _pixel_poses(path: Path, skipped: SkippedEntries) -> Iterator[tuple[int, NDArray[np.float32]]]:
     """Yield time and poses (H, W, 6) of each frame, of the sensor that has them; nothing if not downloaded."""
     columns = (_TIME, _LASER, f"{_PIXEL_POSE}.values", f"{_PIXEL_POSE}.shape")
     for number, row in enumerate(_parquet_rows(path, columns) if path.is_file() else ()):
@@ -293,7 +293,7 @@ def _pixel_poses(path: Path, left_out: SkippedEntries) -> Iterator[tuple[int, ND
             if image is not None:
                 yield whole_number(row[_TIME], _TIME), image
         except ValueError as reason:
-            left_out.add("poses", f"{path}, row {number}", reason)
+            skipped.add("poses", f"{path}, row {number}", reason)
 
 
 def _is_top(row: dict[str, Any]) -> bool:

@@ -63,10 +63,10 @@ class BootstrapSamples:
         if len(np.unique(self.blocks[frames])) < MIN_BLOCKS:
             return None
         order = np.argsort(values, kind="stable")
-        heaped = np.cumsum(self.weights[:, frames[order]], axis=1)
-        total = heaped[:, -1]
+        cumulative = np.cumsum(self.weights[:, frames[order]], axis=1)
+        total = cumulative[:, -1]
         drawn = total > 0
-        middle = (heaped[drawn] >= total[drawn, None] / 2).argmax(axis=1)
+        middle = (cumulative[drawn] >= total[drawn, None] / 2).argmax(axis=1)
         return _interval(values[order][middle])
 
     def ratio_interval(self, parts: _Doubles, wholes: _Doubles) -> tuple[float, float] | None:

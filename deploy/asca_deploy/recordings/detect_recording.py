@@ -178,12 +178,12 @@ def _detect(task: _Task, reading: ScanSettings, options: RuntimeOptions, reporte
     damages = set() if poses is None else {recording.damage}
     scans = RecordedScans(recording, topic, reading.reflectance_scale, task.frame)
     topic = scans.topic
-    mounting, said = scans.mounting(reading)
-    around = scans_need_around(options, mounting, scans.samples(), said) if task.around is None else task.around
+    mounting, remarks = scans.mounting(reading)
+    around = scans_need_around(options, mounting, scans.samples(), remarks) if task.around is None else task.around
     images = None if task.files.rerun is None else NearestImages(recording, task.image_topic)
     if images is not None and images.topic is not None and images.others:
-        said.append(f"images: of {images.topic.name}; --image-topic takes others of {topics_text(images.others)}")
-    for line in said:
+        remarks.append(f"images: of {images.topic.name}; --image-topic takes others of {topics_text(images.others)}")
+    for line in remarks:
         reporter.remark(line)
     births, weak = track_thresholds(options.bundle, task.score)
     least = weak if task.track else task.score
@@ -296,10 +296,10 @@ def _check_times(times: Sequence[int], task: _Task, topic: str, poses: Poses | N
         return
     began, ended = ((int(poses.times_ns[end]) - min(times)) / 1e9 for end in (0, -1))
     share = f"{len(outside)} of {len(times)} scans"
-    said = f"{task.path}, {task.odometry}: poses from {began:+.1f} to {ended:+.1f} s of the first scan; {share}"
+    covered = f"{task.path}, {task.odometry}: poses from {began:+.1f} to {ended:+.1f} s of the first scan; {share}"
     if len(outside) == len(times):
-        raise ScanError(f"{said} are at other times, as of another clock; leave --odometry out")
-    reporter.remark(f"{said} lie outside, with wrong velocities over ground")
+        raise ScanError(f"{covered} are at other times, as of another clock; leave --odometry out")
+    reporter.remark(f"{covered} lie outside, with wrong velocities over ground")
 
 
 def _about(

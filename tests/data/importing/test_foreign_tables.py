@@ -134,8 +134,8 @@ def test_a_table_names_no_file_outside_its_dataset(name: str, tmp_path: Path) ->
     evil = {"token": "evil", "filename": name.format(secret)}
     change_rows(source, "sample_data", lambda rows: rows.append(rows[0] | evil))
     imported = drop_unwritable(read_nuscenes(source))
-    assert len(imported.frames) == 1 and imported.left_out.counts["frames"] == 1
-    assert "not a file below" in imported.left_out.lines()[0]
+    assert len(imported.frames) == 1 and imported.skipped.counts["frames"] == 1
+    assert "not a file below" in imported.skipped.lines()[0]
 
 
 @pytest.mark.parametrize(
@@ -166,7 +166,7 @@ def test_one_bad_row_of_nuscenes_costs_itself(table: str, key: str, value: Any, 
     else:
         with pytest.raises(DatasetError, match="no labelled scan there that can be used"):
             drop_unwritable(imported)
-    assert re.search(message, " ".join(imported.left_out.lines())), imported.left_out.lines()
+    assert re.search(message, " ".join(imported.skipped.lines())), imported.skipped.lines()
 
 
 @pytest.mark.parametrize(
@@ -185,7 +185,7 @@ def test_one_bad_row_of_argoverse_costs_itself(column: str, value: Any, tmp_path
     feather.write_feather(table.set_column(index, column, array), path)
     imported = drop_unwritable(read_argoverse2(source))
     assert [len(frame.records.types) for frame in imported.frames] == [1, 1]
-    assert re.search(r"boxes: 1, the first: .*annotations\.feather, row 0", imported.left_out.lines()[0])
+    assert re.search(r"boxes: 1, the first: .*annotations\.feather, row 0", imported.skipped.lines()[0])
 
 
 @pytest.mark.parametrize("name", ["000001 ", "00\n0001", "00\u20280001", "\ufeff000001", "00\\0001"])

@@ -140,7 +140,7 @@ def test_one_bad_tracklet_costs_itself(tmp_path: Path, old: str, new: str, messa
     imported = read_kitti_raw(write_drive(tmp_path, TRACKLETS.replace(old, new, 1)))
     if left:
         imported = drop_unwritable(imported)
-        assert re.search(message, " ".join(imported.left_out.lines()))
+        assert re.search(message, " ".join(imported.skipped.lines()))
         assert [kind for frame in imported.frames for kind in frame.records.types] == ["Van"] * left
     else:
         with pytest.raises(DatasetError, match=message):
@@ -156,7 +156,7 @@ def test_mistakes_are_named(tmp_path: Path) -> None:
     good = labels.read_text()
     labels.write_text(f"Car 0 0 0\n1 2 Car 0 0 0\n{good}")
     imported = drop_unwritable(read_kitti_tracking(tmp_path))
-    (line,) = imported.left_out.lines()
+    (line,) = imported.skipped.lines()
     assert re.search(r"lines: 2, the first: .*0000\.txt:1: does not begin with a frame's number", line)
     assert sum(len(frame.records.types) for frame in imported.frames) == 2
     for path in labels.parent.iterdir():

@@ -189,7 +189,7 @@ def test_tilted_boxes_are_upright_and_counted(tmp_path: Path) -> None:
     path.write_text(json.dumps(content))
     found = drop_unwritable(read(source, "sustechpoints"))
     assert len(found.frames[0].records.types) == 1
-    assert "box 1: rolled or pitched by 0.2 rad, read upright" in found.left_out.lines()[0]
+    assert "box 1: rolled or pitched by 0.2 rad, read upright" in found.skipped.lines()[0]
 
 
 def test_corrections_are_not_replaced(tmp_path: Path) -> None:
