@@ -17,9 +17,15 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, Literal
 
-from asca_pillars.base.errors import AscaError, ConfigError, OutputError
+from asca_pillars.base.errors import AscaError, ConfigError
 from asca_pillars.base.locks import CAN_LOCK, RETIRED, is_temporary, locked, recover
-from asca_pillars.base.own_files import Recognizer, require_no_link, require_own_file, require_replaceable
+from asca_pillars.base.own_files import (
+    Recognizer,
+    require_no_link,
+    require_own_file,
+    require_regular_file,
+    require_replaceable,
+)
 
 _LFS_POINTER = b"version https://git-lfs"
 _LARGEST_POINTER_BYTES = 1024  # as Git LFS defines its pointers
@@ -94,10 +100,8 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         OSError: names `path`, even where the system's own error names no file (a full disk).
     """
     target = _prepare(path)
-    if target.exists() and not target.is_file():
-        raise OutputError(
-            f"{path}: is {'a folder' if target.is_dir() else 'not a regular file'}; choose the name of a file"
-        )
+    if target.exists():
+        require_regular_file(Path(path))
     longest = _LONGEST_NAME_BYTES - len(".12345678.asca-") - len(os.fsencode(target.suffix))
     stem = os.fsencode(target.stem)[:longest].decode(errors="ignore")
     with _with_path_in_errors(path), _temporary(target, stem, target.suffix, folder=False) as temporary:

@@ -106,14 +106,19 @@ def require_own_file(
     require_no_link(path)
     if not path.exists():
         return
-    if not path.is_file():
-        raise OutputError(
-            f"{path}: is {'a folder' if path.is_dir() else 'not a regular file'}; choose the name of a file"
-        )
+    require_regular_file(path)
     require_not_input(path, inputs)
     if path.stat().st_size and not is_own(path):
         raise OutputError(
             f"{path}: `{command}` did not write it and would replace it; choose another place, or move it away"
+        )
+
+
+def require_regular_file(path: Path) -> None:
+    """Raise OutputError unless an existing path is a regular file."""
+    if not path.is_file():
+        raise OutputError(
+            f"{path}: is {'a folder' if path.is_dir() else 'not a regular file'}; choose the name of a file"
         )
 
 

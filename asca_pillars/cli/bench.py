@@ -137,7 +137,7 @@ def bench(
     from asca_pillars.base.own_files import json_object, require_own_file
     from asca_pillars.base.progress import Reporter
     from asca_pillars.cli.bench_parts import Parts, measure_parts, named_bundles
-    from asca_pillars.cli.progress import Bars
+    from asca_pillars.cli.progress import Bars, print_remark
     from asca_pillars.scans.find_scans import name_scans
     from asca_pillars.scans.recordings.recorded_scans import RecordedScans, is_recording, open_recording
     from asca_pillars.scans.scan_settings import ScanInput
@@ -174,7 +174,7 @@ def bench(
             notes.append(f"timing {len(timed)} of the {len(paths)} scans, evenly spaced")
         points = [scan_input.read(path).points for path in timed]
     for line in notes:
-        console.print(line, style="yellow", soft_wrap=True)
+        print_remark(console, line)
     if scaling and not len(points[0]):
         raise ScanError("the first scan has no points to take fewer or more of; give another for --scaling")
     bundles = named_bundles([bundle, *(compare or ())])

@@ -76,10 +76,10 @@ def import_dataset(
     """
     from rich.console import Console
 
-    from asca_pillars.base.errors import ConfigError, printable
+    from asca_pillars.base.errors import ConfigError
     from asca_pillars.base.installation import require
     from asca_pillars.base.progress import Reporter
-    from asca_pillars.cli.progress import Bars
+    from asca_pillars.cli.progress import Bars, print_remark
     from asca_pillars.data.importing.imported import drop_unwritable, rename_types, require_own_dataset, write_imported
     from asca_pillars.scans.scan_settings import ScanSettings
 
@@ -112,7 +112,7 @@ def import_dataset(
     boxes = ", ".join(f"{name} {count}" for name, count in counts.boxes.items()) or "none"
     console.print(f"{out}: {counts.train} frames to train on, {counts.val} to validate; boxes: {boxes}", soft_wrap=True)
     for line in (*imported.skipped.lines(), *([counts.doubt] if counts.doubt else [])):
-        console.print(printable(line), style="yellow", soft_wrap=True)
+        print_remark(console, line)
     console.print(f"Next: asca inspect {out} -c asca_small_sim --propose own.yaml", soft_wrap=True)
 
 
