@@ -81,6 +81,8 @@ class AugmentConfig(Strict):
     Attributes:
         insert: objects of other frames that are put into this one.
         flip_probability: of a mirror image about the x axis.
+        flip_x_probability: of a mirror image about the y axis. It puts behind what is ahead, for models that look all
+            around and are trained on views ahead.
         rotation_rad: the scene turns about z by up to this angle either way.
         scale: (smallest, largest) global scaling.
         shift_z_m: the scene rises or sinks by up to this, as another sensor height would show it.
@@ -95,6 +97,7 @@ class AugmentConfig(Strict):
 
     insert: InsertConfig = field(default_factory=InsertConfig)
     flip_probability: float = 0.5
+    flip_x_probability: float = 0.0
     rotation_rad: float = 0.785398
     scale: tuple[float, float] = (0.95, 1.05)
     shift_z_m: float = 0.0
@@ -107,8 +110,8 @@ class AugmentConfig(Strict):
     reflectance_loss_probability: float = 0.0
 
     def __post_init__(self) -> None:
-        shares = ("flip_probability", "point_dropout", "object_cut_probability", "reflectance_loss_probability")
-        require_bounds("augment", self, shares, low=0, high=1)
+        shares = ("flip_probability", "flip_x_probability", "point_dropout", "object_cut_probability")
+        require_bounds("augment", self, (*shares, "reflectance_loss_probability"), low=0, high=1)
         noise = ("rotation_rad", "shift_z_m", "object_rotation_rad", "object_shift_m", "object_jitter_m")
         require_bounds("augment", self, noise, low=0)
         for name in ("scale", "object_reflectance_gain"):

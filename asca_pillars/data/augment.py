@@ -1,5 +1,6 @@
 """Training frames before they become tensors: read, with objects inserted, augmented at random."""
 
+import math
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -121,6 +122,9 @@ def augment(
         scale=rng.uniform(*config.scale),
         shift_z_m=rng.uniform(-config.shift_z_m, config.shift_z_m),
     )
+    # Drawn only where it is asked for: other configurations see the samples that they always saw.
+    if config.flip_x_probability and rng.random() < config.flip_x_probability:
+        motion = motion._replace(flipped=not motion.flipped, rotation_rad=motion.rotation_rad + math.pi)
     move_scene(frame, motion)
     kept = rng.random(len(frame.points)) >= rng.uniform(0, config.point_dropout)
     return replace(frame, points=frame.points[kept], motion=motion)

@@ -204,6 +204,18 @@ def test_seeds_differ_and_half_are_mirrored() -> None:
     assert not np.array_equal(first.points, second.points) and not np.array_equal(first.boxes, second.boxes)
 
 
+def test_what_is_ahead_is_put_behind_in_the_share_that_is_asked_for() -> None:
+    points, boxes, _ = make_scene(0)
+    frame = frame_of(boxes, points)
+    config = replace(STILL, flip_x_probability=0.3)
+    results = [augment(frame, config, np.random.default_rng(seed)) for seed in range(100)]
+    behind = [result for result in results if not np.array_equal(result.points, points)]
+    assert 15 < len(behind) < 45
+    for result in behind:
+        np.testing.assert_allclose(result.points, points * np.array([-1, 1, 1, 1], np.float32), atol=1e-5)
+        assert_objects_kept(frame, result, mirrored=True)
+
+
 @pytest.mark.parametrize(
     ("name", "value", "low", "high"),
     [("rotation_rad", 0.3, -0.3, 0.3), ("scale", (0.9, 1.3), 0.9, 1.3), ("shift_z_m", 0.2, -0.2, 0.2)],
