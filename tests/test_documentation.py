@@ -16,7 +16,7 @@ from tests.helpers.blank_plots import blank_plots
 from tests.helpers.documentation import DOCS, Block, blocks, help_of, run, write_files
 
 PAGES = {str(page.relative_to(DOCS)): page for page in sorted(DOCS.rglob("*.md"))}
-RECORDS = {"MODEL_CARD.md", "PERFORMANCE.md", "RESULTS.md"}
+RECORDS = {"MODEL_CARD.md", "PERFORMANCE.md", "RESULTS.md", "WEIGHTS.md"}
 """Pages of measurements: their commands are the hours that the figures took."""
 RUN_BY = {"OWN_CLASSES.md": "tests/test_own_classes_page.py"}
 """Pages whose blocks, one after the other, are a test of their own."""

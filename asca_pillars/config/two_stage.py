@@ -61,7 +61,7 @@ class RefineConfig(Strict):
 
 
 def require_no_votes(post: PostProcess) -> None:
-    """Raise ConfigError if boxes of two stages are to vote: refined ones were better alone (docs/MODEL_CARD.md)."""
+    """Raise ConfigError if boxes of two stages are to vote: refined ones were better alone (docs/WEIGHTS.md)."""
     if post.vote_iou is not None:
         raise ConfigError(
             f"model.spec.post.vote_iou = {post.vote_iou:g}: the boxes of a second stage do not vote; leave it out"
