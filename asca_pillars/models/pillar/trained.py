@@ -40,12 +40,13 @@ class TrainedPillars(NamedTuple):
     identity: str
 
 
-def load_trained_pillars(source: str, key: str) -> TrainedPillars:
+def load_trained_pillars(source: str, key: str, student: PillarSpec | None = None) -> TrainedPillars:
     """Load a trained pillar detector.
 
     Args:
         source: a checkpoint of `asca train`, or a bundle that holds one: its folder, or the name of one that ships.
         key: the setting that names it, for messages.
+        student: the spec whose ranges the network gets; None for its own. Weights depend on no range, but zones do.
 
     Raises:
         TrainingError: not a checkpoint, damaged, or made by an incompatible version.
@@ -58,6 +59,9 @@ def load_trained_pillars(source: str, key: str) -> TrainedPillars:
     require_pillar_kind(source, model.kind)
     assert isinstance(model, PillarModel), "it is of kind pillar"
     spec = model.spec if weights.spec is None else weights.spec
+    if student is not None and spec.grid.zones == 1:
+        grid = replace(spec.grid, x_range_m=student.grid.x_range_m, y_range_m=student.grid.y_range_m)
+        spec = replace(spec, grid=grid, limits=replace(spec.limits, max_pillars=student.limits.max_pillars))
     network = build_pillar_detector(replace(model, spec=spec)).eval()
     checkpoint.fill(network)
     return TrainedPillars(network, spec, weights.identity or weights_sha256(network.state_dict()))
@@ -113,7 +117,8 @@ class Distillation:
         teacher: a checkpoint of `asca train`, or a bundle that holds one: its folder, or the name of one that ships.
 
     Raises:
-        ConfigError: `config` is of another kind, or the teacher has other pillars, anchors or active cells.
+        ConfigError: `config` is of another kind, or the teacher has other pillars, anchors or active cells. Its ranges
+            may differ where its pillars are uniform.
         AscaError: as `load_trained_pillars`.
     """
 
@@ -121,12 +126,12 @@ class Distillation:
         model = config.model
         if not isinstance(model, PillarModel):
             raise ConfigError(f"train.teacher = {teacher}: only model.kind pillar supports a teacher; leave it out")
-        self._network, spec, _ = load_trained_pillars(teacher, "train.teacher")
+        self._network, spec, _ = load_trained_pillars(teacher, "train.teacher", student=model.spec)
         self._loss, self._weight = model.loss, config.train.teacher_weight
         student, teaching = model.network, self._network.preparation
         if _anchors(spec) != _anchors(model.spec):
             raise ConfigError(
-                f"train.teacher = {teacher}: its model.spec differs; give both the same grid, limits and classes"
+                f"train.teacher = {teacher}: its model.spec differs; give both the same pillars and classes"
             )
         if teaching.active_cells != (student.active_cells if student.neck == "sparse" else None):
             raise ConfigError(

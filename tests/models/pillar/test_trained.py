@@ -15,6 +15,7 @@ from asca_pillars.detection.decode import HeadMaps
 from asca_pillars.models.checkpoint_file import read_checkpoint
 from asca_pillars.models.pillar.loss import FOREGROUND_SCORE, box_loss, distillation_loss
 from asca_pillars.models.pillar.trained import Distillation
+from asca_pillars.ops.pillar.spec import PillarSpec
 from asca_pillars.training.loop import train
 from tests.export.tiny import tiny_checkpoint
 from tests.helpers.saved_checkpoint import save_checkpoint
@@ -33,6 +34,14 @@ def one_anchor(score: float, box: list[float], direction: list[float]) -> HeadMa
 def with_network(**changes: object) -> Config:
     network = dataclasses.replace(NETWORK, **changes)  # type: ignore[arg-type]
     return dataclasses.replace(CONFIG, model=PillarModel(spec=SPEC, network=network))
+
+
+def with_spec(spec: PillarSpec) -> Config:
+    return dataclasses.replace(CONFIG, model=PillarModel(spec=spec, network=NETWORK))
+
+
+def narrower(spec: PillarSpec) -> PillarSpec:
+    return dataclasses.replace(spec, grid=dataclasses.replace(spec.grid, y_range_m=(-5.12, 5.12)))
 
 
 @pytest.fixture
@@ -97,13 +106,21 @@ def test_a_missing_teacher_is_said_before_the_folder_is_made(tmp_path: Path) -> 
     assert not (tmp_path / "run" / "config.yaml").exists() and not (data / "prepared").exists()
 
 
+def test_a_teacher_of_uniform_pillars_looks_where_the_student_looks(tmp_path: Path) -> None:
+    uniform = dataclasses.replace(SPEC, grid=dataclasses.replace(SPEC.grid, zones=1))
+    save_checkpoint(tmp_path / "teacher.ckpt", tiny_checkpoint("channel", uniform))
+    config = with_spec(narrower(uniform))
+    taught = dataclasses.replace(config.train, epochs=1, teacher=str(tmp_path / "teacher.ckpt"))
+    last = train(dataclasses.replace(config, train=taught), write_dataset(tmp_path / "data", 3), tmp_path / "run")
+    assert read_checkpoint(last).steps == 1
+
+
 def test_teachers_that_do_not_fit_are_refused(teacher: str, tmp_path: Path) -> None:
     Distillation(CONFIG, teacher)
     Distillation(with_network(pillar_channels=8, upsample_channels=8), teacher)  # a smaller detector
-    narrower = dataclasses.replace(SPEC, grid=dataclasses.replace(SPEC.grid, y_range_m=(-5.12, 5.12)))
-    other = PillarModel(spec=narrower, network=NETWORK)
-    with pytest.raises(ConfigError, match=r"teacher\.ckpt: its model\.spec differs"):
-        Distillation(dataclasses.replace(CONFIG, model=other), teacher)
+    for zoned in (narrower(SPEC), dataclasses.replace(SPEC, grid=dataclasses.replace(SPEC.grid, zones=1))):
+        with pytest.raises(ConfigError, match=r"teacher\.ckpt: its model\.spec differs"):
+            Distillation(with_spec(zoned), teacher)
     with pytest.raises(ConfigError, match=r"teacher\.ckpt: its neck differs"):
         Distillation(with_network(neck="sparse"), teacher)
     with pytest.raises(ConfigError, match=r"train\.teacher = .*only model\.kind pillar"):
