@@ -56,8 +56,8 @@ def evaluate_boxes(
         class_names = model.spec.class_names
         subject, about = f"{model.name} on {data}, {task.split_name}", about | {"model": model.about}
     else:
-        who = predictions_name(predictions)
-        analysis = prepare_errors(who, split, task.errors_by, task.beside) if task.errors else None
+        model_name = predictions_name(predictions)
+        analysis = prepare_errors(model_name, split, task.errors_by, task.beside) if task.errors else None
         frames = read_box_predictions(predictions, split, reporter=reporter)
         class_names = tuple(sorted({kind for frame in frames.frames for kind in frame.detection_types}))
         scores = scores_by_class(task.score, dict.fromkeys(class_names, TEXT_SCORE))

@@ -79,11 +79,11 @@ class ErrorAnalysis:
     beside: tuple[ErrorReport, ...]
 
 
-def prepare_errors(who: str, split: LabeledSplit, by: str | None, beside: Sequence[Path]) -> ErrorAnalysis:
+def prepare_errors(model_name: str, split: LabeledSplit, by: str | None, beside: Sequence[Path]) -> ErrorAnalysis:
     """Read the inputs of an error analysis: before a model runs, so that errors are found early.
 
     Args:
-        who: name of the model or its predictions.
+        model_name: name of the model or its predictions.
         split: the frames.
         by: see `evaluation.errors.error_report.parts_of`; None for no parts.
         beside: errors.json of other evaluations, for the same tables.
@@ -92,7 +92,7 @@ def prepare_errors(who: str, split: LabeledSplit, by: str | None, beside: Sequen
         ConfigError, DatasetError: as `parts_of` and `read_report`.
     """
     root = Path(split.root)
-    where = f"{who} {root.resolve().name}"
+    where = f"{model_name} {root.resolve().name}"
     parts = {} if by is None else parts_of(root, split.name, split.frame_ids, by)
     named = {f"{where}/{part}": ids for part, ids in parts.items()}
     return ErrorAnalysis(f"{where}/{split.name}", named, tuple(read_report(path) for path in beside))

@@ -186,13 +186,13 @@ def columns_of(window: Window, phase_counts: float, first_column: Ints, columns:
 
 @cached(inline="always", **PLAIN)
 def keep(
-    nearest: NearestHits, k: int, j: int, reach: float, who: int, incidence: float, normal: float, gloss: float
+    nearest: NearestHits, k: int, j: int, reach: float, owner: int, incidence: float, normal: float, gloss: float
 ) -> None:
     """Store a hit that is nearer than the previous ones of ray (k, j).
 
     The surface has reflectance `normal` at normal incidence.
     """
     nearest.rho_m[k, j] = reach
-    nearest.owner[k, j] = who
+    nearest.owner[k, j] = owner
     nearest.cosine[k, j] = incidence
     nearest.reflectance[k, j] = normal * incidence**gloss
