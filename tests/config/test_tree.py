@@ -164,7 +164,7 @@ AT_LEAST_0 = (
     *("train.learning_rate", "train.weight_decay", "train.seed"),
 )
 SHARES = (
-    *("model.loss.focal_alpha", "augment.flip_probability", "augment.point_dropout"),
+    *("model.loss.focal_alpha", "augment.flip_probability", "augment.flip_x_probability", "augment.point_dropout"),
     *("augment.object_cut_probability", "augment.reflectance_loss_probability"),
 )
 

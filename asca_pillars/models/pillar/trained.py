@@ -46,7 +46,8 @@ def load_trained_pillars(source: str, key: str, student: PillarSpec | None = Non
     Args:
         source: a checkpoint of `asca train`, or a bundle that holds one: its folder, or the name of one that ships.
         key: the setting that names it, for messages.
-        student: the spec whose ranges the network gets; None for its own. Weights depend on no range, but zones do.
+        student: the spec whose ranges the network gets; None for its own. Weights depend on no range, but zones do, and
+            anchors that stand at its ends.
 
     Raises:
         TrainingError: not a checkpoint, damaged, or made by an incompatible version.
@@ -59,7 +60,7 @@ def load_trained_pillars(source: str, key: str, student: PillarSpec | None = Non
     require_pillar_kind(source, model.kind)
     assert isinstance(model, PillarModel), "it is of kind pillar"
     spec = model.spec if weights.spec is None else weights.spec
-    if student is not None and spec.grid.zones == 1:
+    if student is not None and spec.grid.zones == 1 and spec.anchor_places == "cells":
         grid = replace(spec.grid, x_range_m=student.grid.x_range_m, y_range_m=student.grid.y_range_m)
         spec = replace(spec, grid=grid, limits=replace(spec.limits, max_pillars=student.limits.max_pillars))
     network = build_pillar_detector(replace(model, spec=spec)).eval()
@@ -131,7 +132,7 @@ class Distillation:
         student, teaching = model.network, self._network.preparation
         if _anchors(spec) != _anchors(model.spec):
             raise ConfigError(
-                f"train.teacher = {teacher}: its model.spec differs; give both the same pillars and classes"
+                f"train.teacher = {teacher}: its model.spec differs; give both the same grid, limits and classes"
             )
         if teaching.active_cells != (student.active_cells if student.neck == "sparse" else None):
             raise ConfigError(

@@ -121,6 +121,10 @@ def test_teachers_that_do_not_fit_are_refused(teacher: str, tmp_path: Path) -> N
     for zoned in (narrower(SPEC), dataclasses.replace(SPEC, grid=dataclasses.replace(SPEC.grid, zones=1))):
         with pytest.raises(ConfigError, match=r"teacher\.ckpt: its model\.spec differs"):
             Distillation(with_spec(zoned), teacher)
+    ends = dataclasses.replace(SPEC, grid=dataclasses.replace(SPEC.grid, zones=1), anchor_places="ends")
+    save_checkpoint(tmp_path / "ends.ckpt", tiny_checkpoint("channel", ends))
+    with pytest.raises(ConfigError, match=r"ends\.ckpt: its model\.spec differs"):
+        Distillation(with_spec(narrower(ends)), str(tmp_path / "ends.ckpt"))
     with pytest.raises(ConfigError, match=r"teacher\.ckpt: its neck differs"):
         Distillation(with_network(neck="sparse"), teacher)
     with pytest.raises(ConfigError, match=r"train\.teacher = .*only model\.kind pillar"):
