@@ -132,12 +132,13 @@ class Distillation:
         student, teaching = model.network, self._network.preparation
         if _anchors(spec) != _anchors(model.spec):
             raise ConfigError(
-                f"train.teacher = {teacher}: its model.spec differs; give both the same grid, limits and classes"
+                f"train.teacher = {teacher}: its model.spec differs; give both the same grid, limits and classes, or "
+                "set train.teacher=null"
             )
         if teaching.active_cells != (student.active_cells if student.neck == "sparse" else None):
             raise ConfigError(
                 f"train.teacher = {teacher}: its neck differs; give both the same model.network.neck and "
-                "model.network.active_cells"
+                "model.network.active_cells, or set train.teacher=null"
             )
 
     def __call__(self, outputs: PillarOutputs, batch: Any) -> Mapping[str, Tensor]:

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from asca_pillars.base.errors import BundleError, ConfigError
 from asca_pillars.config.pillar import LossConfig, PillarModel
-from asca_pillars.config.tree import Config
+from asca_pillars.config.tree import Config, load_config
 from asca_pillars.config.two_stage import RefineModel
 from asca_pillars.detection.decode import HeadMaps
 from asca_pillars.models.checkpoint_file import read_checkpoint
@@ -113,6 +113,12 @@ def test_a_teacher_of_uniform_pillars_looks_where_the_student_looks(tmp_path: Pa
     taught = dataclasses.replace(config.train, epochs=1, teacher=str(tmp_path / "teacher.ckpt"))
     last = train(dataclasses.replace(config, train=taught), write_dataset(tmp_path / "data", 3), tmp_path / "run")
     assert read_checkpoint(last).steps == 1
+
+
+def test_fine_tuning_is_taught_by_the_model_that_it_starts_from() -> None:
+    config = load_config("fine_tune")
+    assert config.train.teacher == "default_float32" and config.train.teacher_weight > 0
+    Distillation(config, config.train.teacher)
 
 
 def test_teachers_that_do_not_fit_are_refused(teacher: str, tmp_path: Path) -> None:
