@@ -5,8 +5,8 @@
     detections = Detector()(read_scan("scan.bin").points)
 
 The names below are the stable ones (docs/API.md). They are imported when they are first used, so that
-`import asca_pillars` costs nothing. PyTorch is imported when `train` or `export` is called, or `evaluate` with a
-checkpoint.
+`import asca_pillars` costs nothing. PyTorch is imported when `train`, `adapt` or `export` is called, or `evaluate`
+with a checkpoint.
 """
 
 import importlib
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from asca_deploy.evaluate import evaluate
     from asca_deploy.open_model import RuntimeOptions
     from asca_deploy.recordings.detect_recording import detect_recording
+    from asca_export.adapt import adapt
     from asca_export.export_checkpoint import export
     from asca_pillars.base.errors import AscaError
     from asca_pillars.detection.detections import Detection, Detections, FrameReport
@@ -49,6 +50,7 @@ __all__ = [
     "Tracker",
     "Tracks",
     "__version__",
+    "adapt",
     "detect_recording",
     "detect_scans",
     "evaluate",
@@ -74,6 +76,7 @@ _HOMES = {
     "ScanSettings": "asca_pillars.scans.scan_settings",
     "Tracker": "asca_deploy",
     "Tracks": "asca_deploy",
+    "adapt": "asca_export.adapt",
     "detect_recording": "asca_deploy.recordings.detect_recording",
     "detect_scans": "asca_deploy.detect_scans",
     "evaluate": "asca_deploy.evaluate",

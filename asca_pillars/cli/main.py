@@ -8,6 +8,7 @@ import typer
 
 from asca_pillars import __version__
 from asca_pillars.cli.ablate import ablate
+from asca_pillars.cli.adapt import adapt
 from asca_pillars.cli.average_weights import average_weights
 from asca_pillars.cli.bench import bench
 from asca_pillars.cli.bundle import app as bundle
@@ -45,6 +46,7 @@ _add(import_dataset, "import")
 _add(inspect)
 _add(prepare)
 _add(train)
+_add(adapt)
 _add(evaluate, "eval")
 _add(export)
 _add(average_weights, "average-weights")
