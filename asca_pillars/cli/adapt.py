@@ -89,6 +89,7 @@ def adapt(
                 progress=bars,
                 remark=bars.remark,
                 bar=bar,
+                step=bars.step,
             )
     except TrainingInterruptedError as stop:
         console.print(str(stop))

@@ -1,6 +1,6 @@
 """Training on scans without labels: `asca adapt`."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,7 +12,7 @@ from asca_deploy.detect_scans import detect_scans
 from asca_deploy.open_model import RuntimeOptions
 from asca_deploy.result_files import RUN_FILE
 from asca_deploy.shipped import find_checkpoint
-from asca_pillars.base.errors import ConfigError
+from asca_pillars.base.errors import ConfigError, ScanError
 from asca_pillars.base.files import atomic_path
 from asca_pillars.base.installation import require
 from asca_pillars.base.own_files import require_replaceable
@@ -63,6 +63,7 @@ def adapt(
     progress: Progress | None = None,
     remark: Remark | None = None,
     bar: "ProgressBar | None" = None,
+    step: Callable[[str], None] | None = None,
 ) -> AdaptResult:
     """Train `default` on with the boxes that `accurate` finds in scans without labels; what `asca adapt` does.
 
@@ -80,9 +81,10 @@ def adapt(
         progress: called after each scan and each step of the training.
         remark: called with what is odd about the scans and the run.
         bar: shows the training in place of `progress` and `remark`.
+        step: called with a description of each step of the export.
 
     Raises:
-        ScanError: there are no scans, or none can be read.
+        ScanError: there are no scans, none can be read, or nothing is found in them.
         AscaError: `out` or the folder beside it holds something else, or the training cannot be run.
     """
     require("train")
@@ -117,6 +119,11 @@ def adapt(
     )
     for line in found.remarks:
         reporter.remark(line)
+    if not any(len(scan.detections) for scan in found):
+        raise ScanError(
+            f"{scans}: {_LABELLER} finds nothing in {len(found)} scans, so there is nothing to learn; look at them "
+            f"with `asca view`, and describe how they lie (docs/SENSORS.md)"
+        )
     folder = source if source.is_dir() else source.parent
     imported = drop_unwritable(read_box_files(run / "boxes" / RUN_FILE, folder, reading))
     counts = write_imported(run / "data", imported, _VAL_SHARE)
@@ -130,6 +137,7 @@ def adapt(
         int8=True,
         with_weights=True,
         progress=progress,
+        step=step,
     )
     return AdaptResult(bundle, counts.train, counts.val, counts.boxes, tuple(reporter.remarks))
 

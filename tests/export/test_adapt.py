@@ -107,6 +107,13 @@ def test_what_is_in_the_way_is_said_at_once(tmp_path: Path, student: Path, folde
     assert not (tmp_path / "mine_run").exists()
 
 
+def test_scans_in_which_nothing_is_found(tmp_path: Path, student: Path) -> None:
+    (tmp_path / "empty").mkdir()
+    np.save(tmp_path / "empty" / "0.npy", np.array([[10.0, 0, -1.7, 0.2]], np.float32))
+    with pytest.raises(ScanError, match="fast finds nothing in 1 scans"):
+        adapt(tmp_path / "empty", tmp_path / "mine")
+
+
 def test_what_ships_is_what_is_adapted() -> None:
     config = load_config(module._CONFIG)
     shipped = load_bundle(find_checkpoint(module._STUDENT).parent)
