@@ -29,7 +29,11 @@ def adapt(
     frames: Annotated[
         int,
         typer.Option(
-            "--frames", "-n", min=10, help="So many scans, evenly spaced, are learnt from.", rich_help_panel="Input"
+            "--frames",
+            "-n",
+            min=10,
+            help="At most so many scans, evenly spaced, are learnt from.",
+            rich_help_panel="Input",
         ),
     ] = 250,
     sensor_height: SensorHeightOption = None,

@@ -7,7 +7,7 @@ from collections import Counter, deque
 from collections.abc import Iterator, Sequence
 from functools import cache, lru_cache
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 from asca_pillars.base.errors import ScanError
 from asca_pillars.base.files import is_hidden, require_content
@@ -21,11 +21,20 @@ _LONGEST_NAME_BYTES = 240
 """File names have at most 255 bytes, and results append suffixes such as `_image.png` to the name of their scan."""
 
 
+Item = TypeVar("Item")
+
+
 class NamedScan(NamedTuple):
     """Scan file, and a relative path without a suffix that is unique among the scans of a run."""
 
     path: Path
     name: Path
+
+
+def evenly_spaced(items: Sequence[Item], most: int) -> list[Item]:
+    """Return at most `most` of the items, evenly spaced, the first among them."""
+    count = min(most, len(items))
+    return [items[number * len(items) // count] for number in range(count)]
 
 
 def find_scans(path: str | Path) -> list[Path]:

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from asca_pillars.base.errors import ConfigError, ScanError
 from asca_pillars.base.strict import Strict
+from asca_pillars.scans.find_scans import evenly_spaced
 from asca_pillars.scans.ground_height import HeightEstimate, NamedPoints, estimate_named_height
 from asca_pillars.scans.mounting import Mounting, read_pose, refuse_axes_with_pose
 from asca_pillars.scans.records import StoredPoints
@@ -125,9 +126,8 @@ def folder_reflectance_scale(paths: Sequence[Path], *, columns: int | None = Non
     A dark scan among brighter ones is then read on the same scale. Scans that cannot be read, or have no points,
     are ignored; where none has reflectances, the scale is auto.
     """
-    chosen = paths if len(paths) <= sample else [paths[i * len(paths) // sample] for i in range(sample)]
     stored = []
-    for path in chosen:
+    for path in evenly_spaced(paths, sample):
         with suppress(ScanError):
             stored.append(read_stored(path, columns))
     return common_reflectance_scale(stored)

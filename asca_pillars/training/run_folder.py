@@ -19,6 +19,7 @@ from asca_pillars.config.tree import Config, Precision, load_config
 from asca_pillars.data.augment import TrainingFrames
 from asca_pillars.data.frames import LabeledSplit, read_frame
 from asca_pillars.models.checkpoint_file import weights_sha256
+from asca_pillars.scans.find_scans import evenly_spaced
 from asca_pillars.scans.input_check import ExpectedInput, measure_expected_input
 from asca_pillars.training.module import cooldown_start, steps_per_epoch
 from asca_pillars.training.run_files import (
@@ -113,10 +114,7 @@ def measure_input(out: Path, frames: TrainingFrames, *, keep: bool, reporter: Re
     path = out / EXPECTED_INPUT_FILE
     if keep and path.exists():
         return read_settings(ExpectedInput, path, (), {})
-    ids = frames.frame_ids
-    count = min(len(ids), EXPECTED_INPUT_FRAMES)
-    spaced = [ids[i * len(ids) // count] for i in range(count)]
-    chosen = reporter.track(spaced, "Measuring training scans")
+    chosen = reporter.track(evenly_spaced(frames.frame_ids, EXPECTED_INPUT_FRAMES), "Measuring training scans")
     scans = (read_frame(frames.split, frame_id, (), camera_view=frames.camera_view).points for frame_id in chosen)
     try:
         measured = measure_expected_input(scans, frames.camera_view)

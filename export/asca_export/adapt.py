@@ -19,7 +19,7 @@ from asca_pillars.base.own_files import require_replaceable
 from asca_pillars.base.progress import Progress, Remark, Reporter
 from asca_pillars.data.importing.imported import drop_unwritable, require_own_dataset, write_imported
 from asca_pillars.data.importing.tool_labels import read_box_files
-from asca_pillars.scans.find_scans import find_scans
+from asca_pillars.scans.find_scans import evenly_spaced, find_scans
 from asca_pillars.scans.recordings.recorded_scans import RecordedScans, is_recording, open_recording
 from asca_pillars.scans.scan_settings import ScanSettings
 
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from lightning.pytorch.callbacks import ProgressBar
 
 FRAMES = 250
-"""Scans that are learnt from, unless others are asked for."""
+"""At most so many scans are learnt from, unless another number is given."""
 _STUDENT, _LABELLER, _CONFIG = "default", "accurate", "fine_tune"
 _SHARES = (0.5, 0.5)  # of the trained weights and of the first ones
 _VAL_SHARE = 0.2
@@ -74,7 +74,7 @@ def adapt(
         scans: a folder of scans, or a recording.
         out: folder of the bundle; an earlier bundle there is replaced. Boxes, checkpoints and a recording's scans go
             to a folder beside it, with `_run` after its name.
-        frames: so many scans, evenly spaced, are learnt from.
+        frames: at most so many scans, evenly spaced, are learnt from.
         topic: of a recording: the topic of its scans; None: the only one.
         reading: how the scans are read and the sensor was mounted.
         devices: number of devices on this machine, or `auto`.
@@ -105,10 +105,8 @@ def adapt(
     if is_recording(source):
         source = _write_scans(source, topic, run / "scans", frames, reading, reporter)
         reading = replace(reading, reflectance_scale=1.0, columns=None)
-    paths = find_scans(source)
-    chosen = paths[:: -(-len(paths) // frames)]
     found = detect_scans(
-        chosen,
+        evenly_spaced(find_scans(source), frames),
         run / "boxes",
         options=RuntimeOptions(bundle=_LABELLER),
         reading=reading,
@@ -150,15 +148,15 @@ def run_folder(out: Path) -> Path:
 def _write_scans(
     path: Path, topic: str | None, folder: Path, frames: int, reading: ScanSettings, reporter: Reporter
 ) -> Path:
-    """Write `frames` evenly spaced scans of a recording to `folder`, and return it."""
+    """Write at most `frames` scans of a recording, evenly spaced, to `folder`, and return it."""
     require("recordings")
     recording = open_recording(path, reporter)
     scans = RecordedScans(recording, recording.point_cloud_topic(topic), reading.reflectance_scale)
     folder.mkdir(parents=True, exist_ok=True)
-    step = -(-scans.topic.messages // frames)
+    chosen = set(evenly_spaced(range(scans.topic.messages), frames))
     written = set()
     for item in reporter.track(scans.read(), "Reading scans", scans.topic.messages):
-        if item.scan is not None and item.number % step == 0:
+        if item.scan is not None and item.number in chosen:
             path = folder / f"{item.number:06d}.npy"
             with atomic_path(path) as temporary, temporary.open("wb") as file:
                 np.save(file, item.scan.points)

@@ -19,7 +19,7 @@ from asca_pillars.base.settings import with_overrides
 from asca_pillars.config.pillar import PillarModel
 from asca_pillars.detection.spec import DetectorSpec, ScoreThresholds
 from asca_pillars.ops.pillar.spec import PillarSpec
-from asca_pillars.scans.find_scans import find_scans
+from asca_pillars.scans.find_scans import evenly_spaced, find_scans
 from asca_pillars.scans.scan_reader import read_scan
 
 if TYPE_CHECKING:
@@ -171,9 +171,7 @@ def read_or_simulate(
     Each is (N, 4): x, y, z in metres, LiDAR frame, and reflectance.
     """
     if folder is not None:
-        paths = find_scans(folder)
-        chosen = paths if len(paths) <= most else [paths[i * len(paths) // most] for i in range(most)]
-        return [read_scan(path).points for path in chosen]
+        return [read_scan(path).points for path in evenly_spaced(find_scans(folder), most)]
     from asca_pillars.sim.simulation import SimulationConfig, simulate_frame
 
     config = SimulationConfig(field_of_view=view)

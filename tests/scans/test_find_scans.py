@@ -11,7 +11,7 @@ import pytest
 from asca_pillars.base.errors import ScanError
 from asca_pillars.base.files import atomic_path
 from asca_pillars.data.insertion.prepared import require_writable
-from asca_pillars.scans.find_scans import find_scans, name_scans
+from asca_pillars.scans.find_scans import evenly_spaced, find_scans, name_scans
 from asca_pillars.scans.scan_reader import read_scan
 
 
@@ -24,6 +24,12 @@ def touch(root: Path, *names: str) -> Path:
 
 def names(*paths: Path) -> list[str]:
     return [scan.name.as_posix() for scan in name_scans(paths)]
+
+
+def test_evenly_spaced() -> None:
+    assert evenly_spaced("abcdefghij", 4) == ["a", "c", "f", "h"]
+    assert evenly_spaced(range(5), 9) == [0, 1, 2, 3, 4]
+    assert evenly_spaced([], 3) == []
 
 
 def test_scans_stand_in_natural_order_and_links_are_followed_but_not_in_circles(tmp_path: Path) -> None:

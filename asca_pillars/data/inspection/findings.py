@@ -24,6 +24,7 @@ from asca_pillars.geometry.overlap import aligned_bev_iou
 from asca_pillars.ops.pillar.grid import NECK_STRIDE
 from asca_pillars.ops.pillar.spec import PillarSpec
 from asca_pillars.ops.pv_rcnn.spec import MAP_MULTIPLE
+from asca_pillars.scans.find_scans import evenly_spaced
 from asca_pillars.scans.input_check import TOLERANCE_M
 
 # Larger shares indicate an error or cost recall; KITTI and the simulator are well below all of them.
@@ -300,8 +301,7 @@ def propose(split: LabeledSplit, config: Config, *, frames: int = 500, reporter:
     Raises:
         DatasetError: a frame cannot be read, or no type has enough boxes.
     """
-    ids = split.frame_ids
-    chosen = [ids[number * len(ids) // min(frames, len(ids))] for number in range(min(frames, len(ids)))]
+    chosen = evenly_spaced(split.frame_ids, frames)
     clouds = []
     boxes_of: dict[str, list[Singles]] = {}
     findable: dict[str, list[Singles]] = {}
