@@ -12,6 +12,7 @@ from asca_pillars.cli.options import (
     PoseOption,
     ReflectanceScaleOption,
     SensorHeightOption,
+    TopicOption,
     scan_settings,
 )
 from asca_pillars.cli.train import INTERRUPTED
@@ -41,12 +42,7 @@ def adapt(
     pose: PoseOption = None,
     reflectance_scale: ReflectanceScaleOption = "auto",
     columns: ColumnsOption = None,
-    topic: Annotated[
-        str | None,
-        typer.Option(
-            help="Of a recording: the topic of its scans. Default: the only one.", rich_help_panel="Recording"
-        ),
-    ] = None,
+    topic: TopicOption = None,
     out: Annotated[
         Path,
         typer.Option("--out", "-o", help="Folder of the bundle; the training is in OUT_run.", rich_help_panel="Output"),
@@ -55,7 +51,7 @@ def adapt(
     """Train the model that ships on scans of your own, without labels.
 
     The boxes that `accurate` finds ahead stand for labels, and `default` learns them. It then finds more on the same
-    streets, and loses nothing on others: docs/guide/fine_tuning.md has figures. 250 scans take some ten minutes on two
+    streets, and loses little on others: docs/guide/fine_tuning.md has figures. 250 scans take some ten minutes on two
     cores. After Ctrl-C the same command resumes.
 
     Examples:

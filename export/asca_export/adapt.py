@@ -26,8 +26,6 @@ from asca_pillars.scans.scan_settings import ScanSettings
 if TYPE_CHECKING:
     from lightning.pytorch.callbacks import ProgressBar
 
-FRAMES = 250
-"""At most so many scans are learnt from, unless another number is given."""
 _STUDENT, _LABELLER, _CONFIG = "default", "accurate", "fine_tune"
 _SHARES = (0.5, 0.5)  # of the trained weights and of the first ones
 _VAL_SHARE = 0.2
@@ -56,7 +54,7 @@ def adapt(
     scans: str | Path,
     out: str | Path,
     *,
-    frames: int = FRAMES,
+    frames: int = 250,
     topic: str | None = None,
     reading: ScanSettings = _AS_TRAINED,
     devices: str = "auto",
@@ -103,10 +101,14 @@ def adapt(
     if topic is not None and not is_recording(source):
         raise ConfigError(f"topic {topic}: {source} is not a recording; leave it out")
     if is_recording(source):
-        source = _write_scans(source, topic, run / "scans", frames, reading, reporter)
+        folder = run / "scans"
+        paths = _write_scans(source, topic, folder, frames, reading, reporter)
         reading = replace(reading, reflectance_scale=1.0, columns=None)
+    else:
+        folder = source if source.is_dir() else source.parent
+        paths = evenly_spaced(find_scans(source), frames)
     found = detect_scans(
-        evenly_spaced(find_scans(source), frames),
+        paths,
         run / "boxes",
         options=RuntimeOptions(bundle=_LABELLER),
         reading=reading,
@@ -120,12 +122,13 @@ def adapt(
     if not any(len(scan.detections) for scan in found):
         raise ScanError(
             f"{scans}: {_LABELLER} finds nothing in {len(found)} scans, so there is nothing to learn; look at them "
-            f"with `asca view`, and describe how they lie (docs/SENSORS.md)"
+            "with `asca view`, and describe how they lie (docs/SENSORS.md)"
         )
-    folder = source if source.is_dir() else source.parent
     imported = drop_unwritable(read_box_files(run / "boxes" / RUN_FILE, folder, reading))
     counts = write_imported(run / "data", imported, _VAL_SHARE)
-    last = train(_CONFIG, run / "data", run / "training", devices=devices, init=first, progress=progress, bar=bar)
+    last = train(
+        _CONFIG, run / "data", run / "training", devices=devices, init=first, progress=progress, remark=remark, bar=bar
+    )
     average = last.with_name("average.ckpt")  # in the run's folder, whose command the bundle then states
     average_checkpoints([last, first], average, _SHARES)
     bundle = export(
@@ -147,20 +150,17 @@ def run_folder(out: Path) -> Path:
 
 def _write_scans(
     path: Path, topic: str | None, folder: Path, frames: int, reading: ScanSettings, reporter: Reporter
-) -> Path:
-    """Write at most `frames` scans of a recording, evenly spaced, to `folder`, and return it."""
+) -> list[Path]:
+    """Write at most `frames` scans of a recording, evenly spaced, to `folder`, and return their paths."""
     require("recordings")
     recording = open_recording(path, reporter)
     scans = RecordedScans(recording, recording.point_cloud_topic(topic), reading.reflectance_scale)
     folder.mkdir(parents=True, exist_ok=True)
     chosen = set(evenly_spaced(range(scans.topic.messages), frames))
-    written = set()
+    paths = []
     for item in reporter.track(scans.read(), "Reading scans", scans.topic.messages):
         if item.scan is not None and item.number in chosen:
-            path = folder / f"{item.number:06d}.npy"
-            with atomic_path(path) as temporary, temporary.open("wb") as file:
+            paths.append(folder / f"{item.number:06d}.npy")
+            with atomic_path(paths[-1]) as temporary, temporary.open("wb") as file:
                 np.save(file, item.scan.points)
-            written.add(path)
-    for path in set(folder.glob("*.npy")) - written:  # of a call with other `frames`
-        path.unlink()
-    return folder
+    return paths
