@@ -130,9 +130,9 @@ def _page(folder: Path) -> Kind:
     """Return the kind of a foreign bundle.json, from which a page is made."""
     source, bundle, package = shipped_bundles()["default"], folder / "bundle", folder / "onnxruntime-web"
     bundle.mkdir()
-    for name in ("encoder.onnx", "backbone.onnx", "main.js", "index.html", "x.mjs"):  # names in a foreign bundle
-        graph = "encoder" if name == "encoder.onnx" else "backbone"
-        (bundle / name).symlink_to(source / f"{graph}.onnx")
+    for name in ("pfn.onnx", "encoder.onnx", "backbone.onnx", "main.js", "index.html", "x.mjs"):  # in a foreign bundle
+        graph = name if name.endswith(".onnx") else "backbone.onnx"
+        (bundle / name).symlink_to(source / graph)
     (package / "dist").mkdir(parents=True)
     (package / "package.json").write_text('{"name": "onnxruntime-web", "version": "9.9.9"}')
     for name in ORT_FILES:

@@ -15,8 +15,9 @@ ort.env.wasm.numThreads = 1;
 ort.env.wasm.wasmBinary = await bytes("ort-wasm-simd-threaded.wasm");
 
 const manifest = JSON.parse(await readFile(join(page, "bundle.json")));
-const graph = (name) => bytes(manifest.graphs[name].file);
-const detector = await Detector.open(manifest, { encoder: await graph("encoder"), backbone: await graph("backbone") }, ort);
+const graphs = {};
+for (const [name, { file }] of Object.entries(manifest.graphs)) graphs[name] = await bytes(file);
+const detector = await Detector.open(manifest, graphs, ort);
 const { points } = readScan("sample.bin", (await bytes("sample.bin")).buffer);
 const times = [];
 for (let scan = 0; scan < 12; scan++) {

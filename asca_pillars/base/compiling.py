@@ -29,11 +29,14 @@ inner = numba.njit(no_cpython_wrapper=True, **_PLAIN)
 """Decorator of functions that only compiled functions of the same file call."""
 
 
-def compiled(*arguments: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Return a decorator that compiles for arguments of these types at import, cached as by `cached`."""
+def compiled(*arguments: Any, **options: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """Return a decorator that compiles for arguments of these types at import, cached as by `cached`.
+
+    `options` are those of `numba.njit`.
+    """
 
     def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
-        kept = cached(nogil=True, **_PLAIN)(function)
+        kept = cached(nogil=True, **_PLAIN, **options)(function)
         if kept is not function:
             kept.compile(arguments)  # type: ignore[attr-defined]  # a numba dispatcher
             kept.disable_compile()  # type: ignore[attr-defined]

@@ -30,6 +30,7 @@ SCHEMA_VERSION = 3
 MANIFEST = "bundle.json"
 BUNDLE_FOLDER = ("asca export", MANIFEST, json_object("schema_version", "graphs", "spec"))
 """Command, marker and its recognizer, as `atomic_directory` takes them."""
+PFN = "pfn"
 ENCODER = "encoder"
 BACKBONE = "backbone"
 REFINE = "refine"
@@ -42,7 +43,7 @@ GRAPHS = {
     "pillar_refine": (*PILLAR_GRAPHS, REFINE),
     "pv_rcnn": (VOXELS, BACKBONE, KEYPOINTS, REFINE),
 }
-"""Names of the graphs of each kind."""
+"""Names of the graphs of each kind; pillar detectors can have PFN before them."""
 NECK = "neck"
 """Output of the backbone of a `pillar_refine` bundle: the head's input (1, H, W, C)."""
 
@@ -283,6 +284,11 @@ class PillarBundle(Bundle):
     pillar: PillarSection
     refine: RefineSection | None = None
     """None for kind pillar, whose bundle.json lacks the key."""
+
+    @property
+    def graph_names(self) -> tuple[str, ...]:
+        """Names of the graphs, with PFN where the encoder is in two graphs."""
+        return (PFN, *GRAPHS[self.kind]) if PFN in self.graphs else GRAPHS[self.kind]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -327,7 +327,7 @@ def graph_metadata(bundle: Bundle) -> dict[str, Any]:
 
 
 def graph_files(folder: str | Path, names: Iterable[str] = PILLAR_GRAPHS) -> dict[str, GraphFile]:
-    """Return the graphs of these names as they lie in `folder`, such as encoder.onnx and backbone.onnx."""
+    """Return the graphs of these names as they lie in `folder`, such as pfn.onnx, encoder.onnx and backbone.onnx."""
     files = {name: f"{name}.onnx" for name in names}
     return {name: GraphFile(file, _sha256((Path(folder) / file).read_bytes())) for name, file in files.items()}
 

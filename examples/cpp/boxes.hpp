@@ -5,7 +5,6 @@
 #include <array>
 #include <cmath>
 #include <cstdint>
-#include <optional>
 #include <tuple>
 #include <vector>
 
@@ -124,18 +123,18 @@ inline std::vector<Box> detections(const float* scores, const float* residuals, 
     const auto rows = cells ? static_cast<int64_t>(cells->size()) : map_cells;
     const auto turns = static_cast<int64_t>(yaws.size());
     const int64_t anchors = static_cast<int64_t>(classes.size()) * turns;
-    const size_t candidates = spec.at("post").at("candidates"), most = spec.at("post").at("max_detections");
-    const double nms_iou = spec.at("post").at("nms_iou");
-    const auto votes = spec.at("post").find("vote_iou");
-    const auto vote_iou = votes == spec.at("post").end() || votes->is_null() ? std::nullopt
-                                                                                 : std::optional(votes->get<double>());
+    const auto& post = spec.at("post");
+    const size_t candidates = post.at("candidates"), most = post.at("max_detections");
+    const double nms_iou = post.at("nms_iou");
+    const bool votes = post.contains("vote_iou") && !post.at("vote_iou").is_null();
+    const double vote_iou = votes ? post.at("vote_iou").get<double>() : 0;
     const double direction_offset = spec.value("direction_offset_rad", detail::kPi / 4);
     std::vector<Box> all;
     for (size_t label = 0; label < classes.size(); ++label) {
         const auto& size = classes[label];
         const auto logit_of = [](double score) { return std::log(score / (1 - score)); };
         const double threshold = logit_of(size.at("score_threshold"));
-        const double floor = vote_iou ? std::min(threshold, logit_of(detail::kVoteScore)) : threshold;
+        const double floor = votes ? std::min(threshold, logit_of(detail::kVoteScore)) : threshold;
         std::vector<std::tuple<float, int64_t, int64_t>> chosen;  // logit downwards, anchor, row
         for (int64_t anchor = label * turns; anchor < static_cast<int64_t>(label + 1) * turns; ++anchor)
             for (int64_t row = 0; row < rows; ++row)
@@ -164,7 +163,7 @@ inline std::vector<Box> detections(const float* scores, const float* residuals, 
             const bool reported = -negative >= threshold;
             if (finite && reported && kept.size() < most && std::none_of(kept.begin(), kept.end(), clashes)) kept.push_back(found);
         }
-        for (const Box& own : kept) all.push_back(vote_iou ? detail::voted(own, entered, *vote_iou) : own);
+        for (const Box& own : kept) all.push_back(votes ? detail::voted(own, entered, vote_iou) : own);
     }
     std::stable_sort(all.begin(), all.end(), [](const Box& a, const Box& b) { return a.score > b.score; });
     if (all.size() > most) all.resize(most);

@@ -30,7 +30,7 @@ using Values = std::map<std::string, Ort::Value>;
 inline Ort::Session open(const Ort::Env& env, const std::string& folder, const json& manifest, const char* graph,
                          int threads) {
     Ort::SessionOptions options;
-    // docs/BUNDLE.md: the encoder needs one thread; the optimizer would quantize layers that are kept in floating
+    // docs/BUNDLE.md: the PFN layer needs one thread; the optimizer would quantize layers that are kept in floating
     // point.
     options.SetIntraOpNumThreads(threads);
     options.AddConfigEntry("optimization.disable_specified_optimizers", "WeightBiasQuantization");
@@ -120,6 +120,7 @@ public:
         : spec_(manifest.at("spec")), grid_(spec_.at("grid")), encoder_(detail::open(env, folder, manifest, "encoder", 1)),
           backbone_(detail::open(env, folder, manifest, "backbone", threads)),
           pillarizer_(grid_, spec_.at("limits").at("max_pillars"), spec_.at("limits").at("max_points")) {
+        if (manifest.at("graphs").contains("pfn")) pfn_.emplace(detail::open(env, folder, manifest, "pfn", 1));
         const auto& pillar = manifest.at("pillar");
         yaws_ = pillar.at("layout").at("anchor_yaws_rad").get<std::vector<float>>();
         empty_ = pillar.at("canvas").at("empty").get<std::vector<T>>();
@@ -178,6 +179,11 @@ private:
         given.emplace("features", detail::tensor(pillars.features, {rows, 9}));
         given.emplace("pillar_index", detail::tensor(pillars.pillar_index, {rows}));
         given.emplace("point_counts", detail::tensor(pillars.point_counts, {count}));
+        if (pfn_) {
+            auto maxima = std::move(detail::run(*pfn_, std::move(given), {"pillar_maxima"})[0]);
+            given.clear();
+            given.emplace("pillar_maxima", std::move(maxima));
+        }
         return std::move(detail::run(encoder_, std::move(given), {"pillar_features"})[0]);
     }
 
@@ -198,6 +204,7 @@ private:
     nlohmann::json spec_;
     Grid grid_;
     Ort::Session encoder_, backbone_;
+    std::optional<Ort::Session> pfn_;  // where encoder.onnx does not take the points
     Pillarizer pillarizer_;
     std::vector<float> yaws_;
     std::vector<T> empty_;                    // (C,) of a cell without a pillar

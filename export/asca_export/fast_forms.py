@@ -6,8 +6,9 @@
   when channels come last: then it moves whole runs of memory.
 - The head's three 1x1 convolutions read the same map: with channels last they are one matrix product, whose results
   stay in floating point when everything before it is 8-bit.
-- Bias and ReLU keep the order of numbers, so the encoder takes the maximum over a pillar's points before both: they
-  then cost a pass over the pillars, of which there are several times fewer.
+- Bias and ReLU keep the order of numbers, so the PFN layer takes the maximum over a pillar's points before both: they
+  then cost a pass over the pillars, of which there are several times fewer. The layer is a graph of its own, because a
+  runtime with a compiled loop for it is faster than any graph.
 - The pseudo-image comes with the first convolution's padding in it, and may come in steps of its own: scale and offset
   of each channel go into that convolution's weights. Offsets are exact because nothing is padded after them.
 
@@ -64,12 +65,21 @@ class Stage(NamedTuple):
     upsample: "Upsample"
 
 
-def fast_encoder(encode: PillarEncoder) -> nn.Module:
-    """Return the encoder, in evaluation mode, as a `FastEncoder` where it has that form, otherwise unchanged.
+class SplitEncoder(NamedTuple):
+    """An encoder as two modules, the second of which takes what the first returns for the pillars."""
+
+    pfn: "PfnLayer"
+    attention: nn.Module
+
+
+def split_encoder(encode: PillarEncoder) -> SplitEncoder | None:
+    """Return the encoder, in evaluation mode, split after the PFN layer; None where it cannot be split.
 
     Attention over points, or a pillar's empty slots, need each point's feature, not the largest alone.
     """
-    return encode if encode.point_attention is not None or encode.slots else FastEncoder(encode)
+    if encode.point_attention is not None or encode.slots:
+        return None
+    return SplitEncoder(PfnLayer(encode), encode.pillar_attention or nn.Identity())
 
 
 @torch.library.custom_op("asca::product_max", mutates_args=())
@@ -83,20 +93,20 @@ def _(features: Tensor, weight: Tensor, pillar_index: Tensor, point_counts: Tens
     return features.new_empty(point_counts.shape[0], weight.shape[1])
 
 
-class FastEncoder(nn.Module):
-    """Linear, max over the points of a pillar, bias, ReLU, attention; see `PillarEncoder`, which stays as it is."""
+class PfnLayer(nn.Module):
+    """Linear, max over the points of a pillar, bias, ReLU; see `PillarEncoder`, which stays as it is."""
 
     def __init__(self, encode: PillarEncoder) -> None:
         super().__init__()
         linear = fuse_linear_bn_eval(encode.linear, encode.norm)
         self.weight, self.bias = nn.Parameter(linear.weight.T.contiguous()), linear.bias
-        self.pillar_attention = encode.pillar_attention or nn.Identity()
 
-    def forward(self, features: Tensor, pillar_index: Tensor, point_counts: Tensor) -> Tensor:
-        """Point features (M, 9) and their pillars -> pillar features (P, C)."""
+    def forward(
+        self, features: Tensor, pillar_index: Tensor, point_counts: Tensor
+    ) -> tuple[Tensor, nn.Parameter, nn.Parameter]:
+        """Point features (M, 9) and their pillars -> maxima (P, C), and the parameters: weight (9, C), bias (C,)."""
         largest = product_max(features, self.weight, pillar_index, point_counts)
-        pillars: Tensor = self.pillar_attention(torch.relu(largest + self.bias))
-        return pillars
+        return torch.relu(largest + self.bias), self.weight, self.bias
 
 
 class FastBackbone(nn.Module):
@@ -229,9 +239,9 @@ class MarkedEncoder(nn.Module):
         super().__init__()
         self.encode = encode
 
-    def forward(self, features: Tensor, pillar_index: Tensor, point_counts: Tensor) -> Tensor:
-        """Point features (M, 9) and their pillars -> pillar features (P, C), see `PillarEncoder`."""
-        encoded = self.encode(features, pillar_index, point_counts)
+    def forward(self, *inputs: Tensor) -> Tensor:
+        """Inputs of the encoder -> pillar features (P, C), see `PillarEncoder`."""
+        encoded = self.encode(*inputs)
         return torch.where(encoded == 0, _LEAST, encoded)
 
 

@@ -1,4 +1,4 @@
-"""Export of PyTorch modules to the two ONNX graphs of a bundle; the scatter between them is not exported."""
+"""Export of PyTorch modules to the ONNX graphs of a pillar bundle; the scatter between them is not exported."""
 
 import dataclasses
 import json
@@ -15,11 +15,12 @@ import torch
 from onnxscript import opset20 as op
 from torch import Tensor, nn
 
-from asca_deploy.bundle import Bundle
+from asca_deploy.bundle import PFN, Bundle
 from asca_deploy.graph import Tensor as Declared
 from asca_deploy.manifest import graph_files, graph_metadata
+from asca_deploy.pillar.encoder import BIAS, PILLAR_MAXIMA, WEIGHT
 from asca_deploy.pillar.graphs import PILLAR_FEATURES
-from asca_export.fast_forms import FastBackbone, MaskedBackbone
+from asca_export.fast_forms import FastBackbone, MaskedBackbone, PfnLayer
 from asca_pillars.config.pillar import TRACED_PILLARS
 from asca_pillars.detection.decode import HeadMaps
 from asca_pillars.ops.pillar.prepare import FEATURES
@@ -30,15 +31,38 @@ OPSET = 20
 _EXAMPLE_ROWS = 6  # rows of the traced example; dynamic in the graph
 LOWEST = -3.0e38  # below any feature; every pillar holds a point, so it never survives the max
 PIECES = 4
-"""Parts of a scan's points that the encoder computes and reduces one after the other: each fits into the cache."""
+"""Parts of a scan's points that the PFN layer computes and reduces one after the other: each fits into the cache."""
 
 
 def export_encoder(encode: nn.Module, path: Path) -> None:
-    """Write encoder.onnx: features (M, 9), pillar_index (M,), point_counts (P,) -> pillar_features (P, C).
+    """Write an encoder.onnx that takes the points: features (M, 9), pillar_index (M,), point_counts (P,) -> (P, C).
 
-    `encode` is a `PillarEncoder`, or has its interface. M and P are dynamic. The `paper` reading takes P up to
-    the limit that it was trained with.
+    `encode` is a `PillarEncoder`, or has its interface. M and P are dynamic.
     """
+    _export_point_graph(_Encoder(encode), path, [PILLAR_FEATURES])
+
+
+def export_pfn(layer: PfnLayer, path: Path) -> None:
+    """Write pfn.onnx: inputs as of `export_encoder` -> pillar_maxima (P, C), weight (9, C), bias (C,)."""
+    _export_point_graph(layer, path, [PILLAR_MAXIMA, WEIGHT, BIAS])
+
+
+def export_attention(attention: nn.Module, channels: int, path: Path) -> None:
+    """Write the encoder.onnx that follows pfn.onnx: pillar_maxima (P, C) -> pillar_features (P, C).
+
+    P is dynamic; the `paper` reading takes it up to the limit that it was trained with.
+    """
+    export_graph(
+        _Attention(attention),
+        (torch.rand(TRACED_PILLARS, channels),),
+        path,
+        input_names=[PILLAR_MAXIMA],
+        output_names=[PILLAR_FEATURES],
+        dynamic_shapes=({0: torch.export.Dim("pillars")},),
+    )
+
+
+def _export_point_graph(module: nn.Module, path: Path, output_names: Sequence[str]) -> None:
     points, pillars = 4 * TRACED_PILLARS, TRACED_PILLARS  # sizes of the traced example; dynamic in the graph
     point_counts = torch.full((pillars,), points // pillars)
     example = (
@@ -48,11 +72,11 @@ def export_encoder(encode: nn.Module, path: Path) -> None:
     )
     rows, cells = torch.export.Dim("points"), torch.export.Dim("pillars")
     export_graph(
-        _Encoder(encode),
+        module,
         example,
         path,
         input_names=["features", "pillar_index", "point_counts"],
-        output_names=[PILLAR_FEATURES],
+        output_names=output_names,
         dynamic_shapes=({0: rows}, {0: rows}, {0: cells}),
     )
 
@@ -130,12 +154,13 @@ def graph_path(folder: Path, name: str) -> Path:
 def sign(folder: Path, bundle: B) -> B:
     """Stamp the graphs in `folder` with what they must not be separated from; the bundle with their SHA-256."""
     properties = {key: json.dumps(value) for key, value in graph_metadata(bundle).items()}
-    for name in bundle.graph_names:
+    names = [name for name in dict.fromkeys((PFN, *bundle.graph_names)) if graph_path(folder, name).is_file()]
+    for name in names:
         path = graph_path(folder, name)
         model = onnx.load(path)
         onnx.helper.set_model_props(model, properties)
         onnx.save(model, path)
-    return dataclasses.replace(bundle, graphs=graph_files(folder, bundle.graph_names))
+    return dataclasses.replace(bundle, graphs=graph_files(folder, names))
 
 
 def export_graph(module: nn.Module, example: Sequence[Tensor], path: Path, **names: Any) -> None:
@@ -171,6 +196,18 @@ def errors_only(name: str) -> Iterator[None]:
         yield
     finally:
         logger.setLevel(level)
+
+
+class _Attention(nn.Module):
+    """One frame's attention, with the one input that the runtime feeds."""
+
+    def __init__(self, attention: nn.Module) -> None:
+        super().__init__()
+        self.attention = attention
+
+    def forward(self, pillar_maxima: Tensor) -> Tensor:
+        attended: Tensor = self.attention(pillar_maxima)
+        return attended
 
 
 class _Encoder(nn.Module):

@@ -9,6 +9,7 @@ import torch
 from numpy.typing import NDArray
 
 from asca_deploy.bundle import Parity
+from asca_deploy.pillar.encoder import PILLAR_MAXIMA, Encoder, pfn_inputs
 from asca_deploy.pillar.graphs import Maps
 from asca_deploy.pillar.pipeline import Canvas, PillarPipeline
 from asca_export.fast_forms import NEVER
@@ -20,6 +21,7 @@ from asca_pillars.geometry.boxes import wrap_angle
 from asca_pillars.geometry.overlap import bev_iou
 from asca_pillars.models.pillar.network import PillarDetector
 from asca_pillars.models.pillar.preparation import PillarBatch, batch_pillars
+from asca_pillars.ops.pillar.prepare import Pillars
 from asca_pillars.ops.pillar.spec import PillarSpec
 from asca_pillars.ops.pv_rcnn.spec import VoxelSpec
 from asca_pillars.ops.two_stage.decode import Scores, reported_detections
@@ -59,6 +61,7 @@ def check_parity(detector: PillarDetector, runtime: PillarPipeline, scans: Seque
             expected_features = detector.encode(batch.features, batch.pillar_index, batch.point_counts)
             expected_maps = _maps(detector, batch)
         features = runtime.encode(pillars)
+        _check_pfn(runtime.encode, pillars, number)
         placed = runtime.backbone.place(features, pillars.cells)
         # Features have no unit, and some readings of the attention sum over thousands of pillars: their scale counts.
         allowed = MAP_TOLERANCE * max(1.0, float(expected_features.abs().max()) if len(expected_features) else 0.0)
@@ -77,6 +80,15 @@ def check_parity(detector: PillarDetector, runtime: PillarPipeline, scans: Seque
         boxes = compare_boxes(expected_maps, maps, spec, number, cells)
         worst_box, worst_yaw = max(worst_box, boxes.center_size_m), max(worst_yaw, boxes.yaw_rad)
     return Parity(worst_map, worst_box, worst_yaw, require_compared(compared), MAP_TOLERANCE)
+
+
+def _check_pfn(encode: Encoder, pillars: Pillars, scan: int) -> None:
+    """Raise ExportError unless pfn.onnx, which runtimes in other languages run, gives what this runtime computes."""
+    if encode.pfn is None or not len(pillars.cells):
+        return
+    computed = encode.maxima(pillars)
+    (maxima,) = encode.pfn.run((PILLAR_MAXIMA,), pfn_inputs(encode.pfn, pillars))
+    require_close("pfn", computed, maxima, MAP_TOLERANCE * max(1.0, float(computed.max())), scan)
 
 
 def require_compared(scans: int) -> int:

@@ -25,11 +25,10 @@ from asca_export.fast_forms import (
     STEP_VALUE,
     CanvasSteps,
     FastBackbone,
-    FastEncoder,
     MarkedEncoder,
     MaskedBackbone,
     Upsample,
-    fast_encoder,
+    split_encoder,
 )
 from asca_export.pillar.export import export_pillar_bundle
 from asca_export.two_stage.first_stage import BundleFirstStage
@@ -55,43 +54,48 @@ def padded(image: torch.Tensor) -> torch.Tensor:
 @torch.no_grad()
 def test_the_maximum_before_bias_and_relu(cpa: CpaReading, tmp_path: Path) -> None:
     encode = tiny_detector(cpa).encode
-    fast = fast_encoder(encode)
-    assert isinstance(fast, FastEncoder)
+    split = split_encoder(encode)
+    assert split is not None
     counts = torch.tensor([1, 4, 2, 32, 1])
     points = torch.randn(40, 9) * 3
     given = (points, torch.arange(5).repeat_interleave(counts), counts)
-    torch.testing.assert_close(fast(*given), encode(*given), atol=1e-5, rtol=1e-5)
-    graphs.export_encoder(fast, tmp_path / "encoder.onnx")
-    operators = [node.op_type for node in onnx.load(tmp_path / "encoder.onnx").graph.node]
+    maxima, *_ = split.pfn(*given)
+    torch.testing.assert_close(split.attention(maxima), encode(*given), atol=1e-5, rtol=1e-5)
+    graphs.export_pfn(split.pfn, tmp_path / "pfn.onnx")
+    operators = [node.op_type for node in onnx.load(tmp_path / "pfn.onnx").graph.node]
     assert operators.index("MatMul") < operators.index("ScatterND") < operators.index("Relu")
 
 
 @pytest.mark.parametrize("counts", [[1], [5], [1, 1], [1, 9], [9, 1], [1, 4, 2, 32, 1], [1] * 50, [64, 64, 64]])
 @torch.no_grad()
-def test_pieces_of_few_points_give_the_same_maximum(counts: list[int], encoder_graph: Path) -> None:
+def test_pieces_of_few_points_give_the_same_maximum(counts: list[int], pfn_graph: Path) -> None:
     """Some of the PIECES that the graph reduces one after the other are empty then."""
-    fast = fast_encoder(tiny_detector("channel").encode)
+    split = split_encoder(tiny_detector("channel").encode)
+    assert split is not None
     sizes = torch.tensor(counts)
     given = {
         "features": torch.randn(sum(counts), 9, generator=torch.Generator().manual_seed(0)) * 3,
         "pillar_index": torch.arange(len(counts)).repeat_interleave(sizes),
         "point_counts": sizes,
     }
-    session = onnxruntime.InferenceSession(encoder_graph)
-    (actual,) = session.run(None, {name: value.numpy() for name, value in given.items()})
-    torch.testing.assert_close(torch.from_numpy(actual), fast(*given.values()), atol=1e-5, rtol=1e-5)
+    session = onnxruntime.InferenceSession(pfn_graph)
+    actual = session.run(None, {name: value.numpy() for name, value in given.items()})
+    for computed, expected in zip(actual, split.pfn(*given.values()), strict=True):
+        torch.testing.assert_close(torch.from_numpy(computed), expected, atol=1e-5, rtol=1e-5)
 
 
 @pytest.fixture(scope="module")
-def encoder_graph(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("pieces") / "encoder.onnx"
-    graphs.export_encoder(fast_encoder(tiny_detector("channel").encode), path)
+def pfn_graph(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("pieces") / "pfn.onnx"
+    split = split_encoder(tiny_detector("channel").encode)
+    assert split is not None
+    graphs.export_pfn(split.pfn, path)
     return path
 
 
 def test_an_encoder_that_needs_every_point_stays_as_it_is() -> None:
     for encode in (tiny_detector("point").encode, tiny_detector("none", empty_slots=True).encode):
-        assert fast_encoder(encode) is encode
+        assert split_encoder(encode) is None
 
 
 @torch.no_grad()
@@ -127,7 +131,7 @@ def test_depth_to_space_is_the_transposed_convolution(stride: int) -> None:
 def test_the_detector_stays_as_it_was() -> None:
     detector = tiny_detector("none")
     before = {name: value.clone() for name, value in detector.state_dict().items()}
-    fast_encoder(detector.encode)
+    split_encoder(detector.encode)
     FastBackbone(detector, CanvasSteps(torch.full((16,), 0.1), torch.full((16,), 9.0)))
     assert all(torch.equal(before[name], value) for name, value in detector.state_dict().items())
     assert detector.neck.get_submodule("blocks.0.0").padding == (1, 1)

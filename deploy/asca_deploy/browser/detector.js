@@ -14,8 +14,8 @@ const NOTHING = { scores: new Float32Array(0), boxes: new Float32Array(0), direc
 export class Detector {
   /**
    * @param {object} manifest bundle.json
-   * @param {{encoder: Uint8Array, backbone: Uint8Array}} graphs the ONNX files
-   * @param {object} ort onnxruntime-web, set to one thread: the encoder needs that (docs/BUNDLE.md)
+   * @param {Record<string, Uint8Array>} graphs the ONNX files by the names in `manifest.graphs`
+   * @param {object} ort onnxruntime-web, set to one thread: the PFN layer needs that (docs/BUNDLE.md)
    */
   static async open(manifest, graphs, ort) {
     if (manifest.schema_version !== 3 || manifest.kind !== "pillar") {
@@ -28,8 +28,9 @@ export class Detector {
     detector.ort = ort;
     detector.manifest = manifest;
     detector.fields = new Map(); // by the spec
-    detector.encoder = await ort.InferenceSession.create(graphs.encoder, OPTIONS);
-    detector.backbone = await ort.InferenceSession.create(graphs.backbone, OPTIONS);
+    for (const [name, graph] of Object.entries(graphs)) {
+      detector[name] = await ort.InferenceSession.create(graph, OPTIONS); // pfn (older bundles have none), encoder, backbone
+    }
     return detector;
   }
 
@@ -108,6 +109,7 @@ export class Detector {
       pillar_index: this.tensor("int64", pillarIndex, [pillarIndex.length]),
       point_counts: this.tensor("int64", pointCounts, [pointCounts.length]),
     };
+    if (this.pfn) given.pillar_maxima = (await run(this.pfn, given, ["pillar_maxima"])).pillar_maxima;
     return (await run(this.encoder, given)).pillar_features.data;
   }
 
@@ -140,7 +142,7 @@ export class Detector {
   }
 }
 
-/** Run a graph on those of the tensors that it declares. */
-function run(session, given) {
-  return session.run(Object.fromEntries(session.inputNames.map((name) => [name, given[name]])));
+/** Run a graph on those of the tensors that it declares, for these outputs. */
+function run(session, given, outputs = session.outputNames) {
+  return session.run(Object.fromEntries(session.inputNames.map((name) => [name, given[name]])), outputs);
 }

@@ -7,7 +7,7 @@ import { sensorHeight } from "./ground.js";
 import { readScan } from "./readers.js";
 import { LOWEST_SCORE } from "./scores.js";
 
-// More threads need headers that a plain file server does not send, and the encoder's graph allows only one.
+// More threads need headers that a plain file server does not send, and the PFN layer's graph allows only one.
 ort.env.wasm.numThreads = 1;
 ort.env.wasm.wasmPaths = { wasm: new URL("ort-wasm-simd-threaded.wasm", import.meta.url).href };
 
@@ -16,8 +16,10 @@ let detector;
 const tasks = {
   async open() {
     const manifest = await (await fetched("bundle.json")).json();
-    const bytes = async (graph) => new Uint8Array(await (await fetched(manifest.graphs[graph].file)).arrayBuffer());
-    const graphs = { encoder: await bytes("encoder"), backbone: await bytes("backbone") };
+    const graphs = {};
+    for (const [name, { file }] of Object.entries(manifest.graphs)) {
+      graphs[name] = new Uint8Array(await (await fetched(file)).arrayBuffer());
+    }
     detector = await Detector.open({ ...manifest, spec: lowered(manifest.spec) }, graphs, ort);
     return manifest;
   },

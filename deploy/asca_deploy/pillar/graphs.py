@@ -1,18 +1,15 @@
-"""Inputs and outputs of the graphs of a pillar bundle, by name, and how they are opened."""
+"""Inputs and outputs of the graphs of a pillar bundle, by name."""
 
-from pathlib import Path
 from typing import Any, NamedTuple, Protocol, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from asca_deploy import providers
-from asca_deploy.bundle import ENCODER, NECK, PillarBundle
-from asca_deploy.graph import Interface, Session, Tensor, check_interface
+from asca_deploy.bundle import NECK, PillarBundle
+from asca_deploy.graph import Interface, Tensor
 from asca_pillars.base.errors import ProviderError
 from asca_pillars.detection.decode import HeadMaps
 from asca_pillars.ops.pillar.neck_rulebooks import LEVELS, SAME, NeckRulebooks
-from asca_pillars.ops.pillar.prepare import FEATURES
 from asca_pillars.ops.two_stage.first_stage import FirstStageOutputs
 
 PILLAR_FEATURES = "pillar_features"
@@ -22,16 +19,6 @@ _NO_SPARSE_NECK = {
     "openvino": "it needs outputs of fixed shapes",
     "tensorrt": "it would build another engine for every number of pillars",
 }
-
-
-def encoder_interface(bundle: PillarBundle) -> Interface:
-    """Return the interface of encoder.onnx: features of M points in P pillars -> features of the pillars."""
-    inputs = {
-        "features": Tensor("float32", (None, len(FEATURES))),
-        "pillar_index": Tensor("int64", (None,)),
-        "point_counts": Tensor("int64", (None,)),
-    }
-    return inputs, {PILLAR_FEATURES: Tensor(bundle.pillar.canvas.type, (None, bundle.pillar.channels))}
 
 
 def output_channels(bundle: PillarBundle, neck_channels: int = 0) -> dict[str, int]:
@@ -60,20 +47,6 @@ def backbone_interface(bundle: PillarBundle, neck_channels: int = 0, neck_type: 
         inputs |= {f"{kind}_{level}": Tensor("int32", (None, SAME.taps)) for kind in ("strided", "first", "same")}
         inputs[f"places_{level}"] = Tensor("int32", (None,))
     return inputs, {name: Tensor(types[name], (None, count)) for name, count in channels.items()}
-
-
-def open_encoder(folder: Path, bundle: PillarBundle) -> Session:
-    """Open encoder.onnx of the bundle in this folder, on the CPU.
-
-    Raises:
-        BundleError: the graph cannot be run or does not match the manifest.
-    """
-    # One thread: the maximum over a pillar's points is a ScatterND with repeated indices, and onnxruntime's threads
-    # race for them: now and then a few features come out too small (onnxruntime issue 18048; seen with 1.31). It is
-    # still the fastest form, ten times faster than ScatterElements.
-    path = folder / bundle.graphs[ENCODER].file
-    session = providers.open_session(path, "cpu", "float32", threads=1)
-    return check_interface(path, session, *encoder_interface(bundle))
 
 
 def check_neck(bundle: PillarBundle, provider: str) -> None:

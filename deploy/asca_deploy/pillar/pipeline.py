@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from asca_deploy import providers
 from asca_deploy.bundle import BACKBONE, NECK, CanvasFormat, PillarBundle
 from asca_deploy.graph import Session, check_interface
+from asca_deploy.pillar.encoder import Encoder
 from asca_deploy.pillar.graphs import (
     PILLAR_FEATURES,
     HeadOutputs,
@@ -19,7 +20,6 @@ from asca_deploy.pillar.graphs import (
     PillarBackbone,
     backbone_interface,
     check_neck,
-    open_encoder,
     output_channels,
 )
 from asca_deploy.pipeline import Pipeline, StageTimes
@@ -68,7 +68,7 @@ class PillarPipeline:
         load_kernels(KERNELS)  # here rather than in the first scan
         self.bundle = bundle
         self.spec: PillarSpec = bundle.spec
-        self._encoder = open_encoder(folder, bundle)
+        self.encode = Encoder(folder, bundle)
         path, neck = folder / bundle.graphs[BACKBONE].file, 0 if bundle.refine is None else bundle.refine.bev_channels
         self.backbone = open_backbone(path, bundle, provider, precision, threads, neck)
         self.stages = ("pillarize", "encode", self.backbone.stage, "neck+head", "decode")
@@ -79,7 +79,7 @@ class PillarPipeline:
         """Prepare the backbone's input from points (N, 4), metres, LiDAR frame, and reflectance."""
         pillars = self.pillarize(points)
         stage_times.append(("pillarize", perf_counter()))
-        # The encoder runs on one thread, see `open_encoder`: another core builds the rulebooks meanwhile.
+        # The encoder runs on one thread, see `encoder._open`: another core builds the rulebooks meanwhile.
         building = self._executor and self._executor.submit(self.backbone.build_rulebooks, pillars.cells)
         features = self.encode(pillars)
         stage_times.append(("encode", perf_counter()))
@@ -103,13 +103,6 @@ class PillarPipeline:
     def pillarize(self, points: NDArray[np.float32]) -> Pillars:
         """Sort finite points (N, 4), metres, LiDAR frame, into P pillars: features of M points. Paper section 3.2."""
         return pillarize(points, self.spec.grid, self.spec.limits)
-
-    def encode(self, pillars: Pillars) -> NDArray[Any]:
-        """Encode features (M, 9) -> pillar features (P, C), of the canvas's type. Paper section 3.2."""
-        if not len(pillars.cells):
-            return np.empty((0, self.bundle.pillar.channels), self.bundle.pillar.canvas.type)
-        values = {name: getattr(pillars, name) for name in self._encoder.inputs}  # a graph may not need all three
-        return self._encoder.run((PILLAR_FEATURES,), values)[0]
 
 
 def open_backbone(

@@ -5,12 +5,13 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from torch import nn
 
-from asca_deploy.bundle import BACKBONE, BUNDLE_FOLDER, ENCODER, CanvasFormat, Parity, PillarBundle, PillarSection
+from asca_deploy.bundle import BACKBONE, BUNDLE_FOLDER, ENCODER, PFN, CanvasFormat, Parity, PillarBundle, PillarSection
 from asca_deploy.pillar.pipeline import PillarPipeline
 from asca_export import graphs
 from asca_export.bundle_writer import DEFAULTS, ExportOptions, draft_bundle, require_parity_scans, write_bundle
-from asca_export.fast_forms import FastBackbone, MarkedEncoder, MaskedBackbone, fast_encoder
+from asca_export.fast_forms import FastBackbone, MarkedEncoder, MaskedBackbone, split_encoder
 from asca_export.int8 import calibration_scans, quantize_bundle
 from asca_export.parity import check_parity
 from asca_export.sparse_forms import SparseBackbone, export_sparse_backbone, sparse_multiply_accumulates
@@ -29,7 +30,7 @@ def export_pillar_bundle(
     scans: Sequence[NDArray[np.float32]],
     options: ExportOptions = DEFAULTS,
 ) -> PillarBundle:
-    """Export kind pillar, see `asca_export.export.export_bundle`: encoder.onnx and backbone.onnx."""
+    """Export kind pillar, see `asca_export.export.export_bundle`: pfn.onnx, encoder.onnx, backbone.onnx."""
     model, detector, calibration = checkpoint.config.model, checkpoint.detector, options.calibration
     assert isinstance(model, PillarModel) and isinstance(detector, PillarDetector), "it is of kind pillar"
     require_parity_scans(scans)
@@ -71,10 +72,14 @@ def require_maskable(model: ModelConfig, *, int8: bool) -> None:
 def _export_graphs(
     detector: PillarDetector, folder: Path, scans: Sequence[NDArray[np.float32]], *, dense_neck: bool
 ) -> float:
-    """Write both graphs; return the backbone's multiply-accumulates, 10^9, of a sparse neck the mean over scans."""
+    """Write the graphs; return the backbone's multiply-accumulates, 10^9, of a sparse neck the mean over scans."""
     preparation = detector.preparation
-    encode = fast_encoder(detector.encode)
-    graphs.export_encoder(MarkedEncoder(encode) if dense_neck else encode, graphs.graph_path(folder, ENCODER))
+    split, encoder = split_encoder(detector.encode), graphs.graph_path(folder, ENCODER)
+    if split is None:
+        graphs.export_encoder(_marked(detector.encode, dense_neck), encoder)
+    else:
+        graphs.export_pfn(split.pfn, graphs.graph_path(folder, PFN))
+        graphs.export_attention(_marked(split.attention, dense_neck), len(split.pfn.bias), encoder)
     path = graphs.graph_path(folder, BACKBONE)
     if dense_neck or preparation.active_cells is None:
         dense = MaskedBackbone(detector) if dense_neck else FastBackbone(detector)
@@ -85,3 +90,7 @@ def _export_graphs(
     rulebooks = [preparation.place(preparation.spec.pillarize(scan)).rulebooks for scan in scans]
     counts = [sparse_multiply_accumulates(backbone, built) for built in rulebooks if built is not None]
     return float(np.mean(counts)) / 1e9
+
+
+def _marked(encode: nn.Module, dense_neck: bool) -> nn.Module:
+    return MarkedEncoder(encode) if dense_neck else encode

@@ -14,7 +14,7 @@ import onnx
 import torch
 from numpy.typing import NDArray
 
-from asca_deploy.bundle import BACKBONE, BUNDLE_FOLDER, ENCODER, REFINE, Parity, PillarBundle, RefineSection
+from asca_deploy.bundle import BACKBONE, BUNDLE_FOLDER, ENCODER, PFN, REFINE, Parity, PillarBundle, RefineSection
 from asca_deploy.detector import Detector
 from asca_deploy.manifest import load_pillar_bundle
 from asca_deploy.shipped import find_bundle
@@ -158,8 +158,14 @@ def export_refine_bundle(
 
 
 def _copy_first_stage(first: Path, proposing: PillarBundle, folder: Path) -> None:
-    shutil.copyfile(first / proposing.graphs[ENCODER].file, graphs.graph_path(folder, ENCODER))
+    _copy_encoder(first, proposing, folder)
     onnx.save(add_neck_output(onnx.load(first / proposing.graphs[BACKBONE].file)), graphs.graph_path(folder, BACKBONE))
+
+
+def _copy_encoder(first: Path, proposing: PillarBundle, folder: Path) -> None:
+    graphs.graph_path(folder, PFN).unlink(missing_ok=True)  # of a form of the first stage that has it
+    for name in {PFN, ENCODER} & set(proposing.graphs):
+        shutil.copyfile(first / proposing.graphs[name].file, graphs.graph_path(folder, name))
 
 
 def _to_int8(
@@ -185,7 +191,7 @@ def _to_int8(
             "not its 8-bit form: export that again"
         )
     expected = list(map(Detector(folder), scans))
-    shutil.copyfile(eight_bit / proposing.graphs[ENCODER].file, graphs.graph_path(folder, ENCODER))
+    _copy_encoder(eight_bit, proposing, folder)
     backbone, step = add_neck_steps(onnx.load(eight_bit / proposing.graphs[BACKBONE].file))
     onnx.save(backbone, graphs.graph_path(folder, BACKBONE))
     refine = graphs.graph_path(folder, REFINE)

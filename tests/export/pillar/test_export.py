@@ -12,16 +12,18 @@ import numpy as np
 import onnx
 import pytest
 import torch
+from numpy.typing import NDArray
 
 from asca_deploy import Detector
 from asca_deploy.manifest import load_pillar_bundle
+from asca_deploy.pillar.encoder import PILLAR_MAXIMA, pfn_inputs
 from asca_deploy.pillar.pipeline import PillarPipeline
 from asca_export import graphs
-from asca_export.fast_forms import FastBackbone
+from asca_export.fast_forms import FastBackbone, PfnLayer
 from asca_export.parity import BOX_TOLERANCE_M, MAP_TOLERANCE, YAW_TOLERANCE_RAD, compare_boxes
 from asca_export.pillar.export import export_pillar_bundle
 from asca_pillars.base.errors import ExportError
-from asca_pillars.config.pillar import PillarModel
+from asca_pillars.config.pillar import CpaReading, PillarModel
 from asca_pillars.data.kitti import KittiSplit
 from asca_pillars.detection.decode import VOTE_SCORE, HeadMaps
 from asca_pillars.models.build import ScanDetector
@@ -81,29 +83,61 @@ def test_features_are_compared_at_their_own_scale(tmp_path: Path) -> None:
 
 def test_graphs_carry_the_contract(exported: Exports) -> None:
     folder = exported("channel")
-    for name in ("encoder.onnx", "backbone.onnx"):
+    for name in ("pfn.onnx", "encoder.onnx", "backbone.onnx"):
         model = onnx.load(folder / name)
         properties = {item.key: json.loads(item.value) for item in model.metadata_props}
         assert properties["spec"]["grid"]["zones"] == SPEC.grid.zones
         assert [spec["name"] for spec in properties["spec"]["classes"]] == list(SPEC.class_names)
         assert b"site-packages" not in (folder / name).read_bytes()  # nor any other folder of this machine
-    encoder = onnx.load(folder / "encoder.onnx").graph
-    assert [node.name for node in encoder.input] == ["features", "pillar_index", "point_counts"]
-    assert encoder.input[0].type.tensor_type.shape.dim[0].dim_param  # the number of points is dynamic
+    for path in (folder / "pfn.onnx", exported("point") / "encoder.onnx"):
+        takes_points = onnx.load(path).graph
+        assert [node.name for node in takes_points.input] == ["features", "pillar_index", "point_counts"]
+        assert takes_points.input[0].type.tensor_type.shape.dim[0].dim_param  # the number of points is dynamic
+    assert [node.name for node in onnx.load(folder / "encoder.onnx").graph.input] == ["pillar_maxima"]
     backbone = onnx.load(folder / "backbone.onnx").graph
     assert [node.name for node in backbone.output] == ["scores", "boxes", "directions"]
 
 
-def test_encoder_gives_the_same_features_every_time(exported: Exports) -> None:
+@pytest.mark.parametrize("cpa", ["none", "point"])
+def test_encoder_gives_the_same_features_every_time(cpa: CpaReading, exported: Exports) -> None:
     """onnxruntime's threads race for the repeated indices of ScatterND: the runtime has to keep them out."""
-    pipeline = Detector(exported("none"), threads=2).pipeline
+    pipeline = Detector(exported(cpa), threads=2).pipeline
     rng = np.random.default_rng(0)
     points = rng.uniform((5, -6, -2, 0), (25, 7, 0, 1), (12000, 4)).astype(np.float32)
     assert isinstance(pipeline, PillarPipeline)
     pillars = pipeline.pillarize(points)
     assert pillars.point_counts.max() > 4  # indices repeat
-    first = pipeline.encode(pillars).copy()
-    assert all(np.array_equal(pipeline.encode(pillars), first) for _ in range(300))
+    encode = pipeline.encode
+
+    def reduced() -> NDArray[np.float32]:
+        if encode.pfn is None:
+            return encode(pillars)
+        (maxima,) = encode.pfn.run((PILLAR_MAXIMA,), pfn_inputs(encode.pfn, pillars))
+        return maxima
+
+    first = reduced()
+    assert all(np.array_equal(reduced(), first) for _ in range(300))
+    if encode.pfn is not None:
+        np.testing.assert_allclose(encode.maxima(pillars), first, rtol=1e-5, atol=1e-5)
+
+
+def test_a_pfn_graph_that_other_runtimes_would_run_differently_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """This runtime takes the parameters from the graph, and computes the layer itself."""
+    export_pfn = graphs.export_pfn
+
+    def export_doubled(layer: PfnLayer, path: Path) -> None:
+        export_pfn(layer, path)
+        model = onnx.load(path)
+        (last,) = (node for node in model.graph.node if PILLAR_MAXIMA in node.output)
+        last.output[0] = "maxima"
+        model.graph.node.append(onnx.helper.make_node("Add", ["maxima", "maxima"], [PILLAR_MAXIMA]))
+        onnx.save(model, path)
+
+    monkeypatch.setattr(graphs, "export_pfn", export_doubled)
+    with pytest.raises(ExportError, match=r"scan 0: PyTorch and onnxruntime differ at stage pfn"):
+        export_pillar_bundle(tiny_checkpoint("none"), tmp_path / "bundle", SCANS)
 
 
 def test_graphs_that_are_not_the_model_are_refused_and_the_old_bundle_stays(

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from asca_deploy import Detector
-from asca_deploy.bundle import GRAPHS
+from asca_deploy.bundle import GRAPHS, PFN
 from asca_deploy.golden import golden_stages
 from asca_deploy.manifest import load_pillar_bundle
 from asca_deploy.two_stage.pipeline import RefinePipeline
@@ -72,7 +72,7 @@ def test_golden_vectors_of_both_stages(trained: tuple[Path, Path]) -> None:
 def test_train_export_detect(trained: tuple[Path, Path], tmp_path: Path) -> None:
     last, folder = trained
     bundle = load_pillar_bundle(folder)
-    assert (bundle.kind, set(bundle.graphs)) == ("pillar_refine", set(GRAPHS["pillar_refine"]))
+    assert (bundle.kind, set(bundle.graphs)) == ("pillar_refine", {PFN, *GRAPHS["pillar_refine"]})
     assert bundle.parity is not None and bundle.parity.scans == len(SCANS) and bundle.refine is not None
     assert_same_detector(load_checkpoint(last), folder)
 
@@ -174,7 +174,7 @@ def test_the_graph_needs_no_scatter_and_no_normalization(trained: tuple[Path, Pa
         (lambda data: data["refine"].update(bev_channels=0), "bev_channels 0 must lie between"),
         (lambda data: data.pop("refine"), "`refine` is missing|`refine` is null"),
         (lambda data: data["refine"]["seen"]["proposals"].update(quotas=[1, 2]), "has not one for each class"),
-        (lambda data: data["graphs"].pop("refine"), "has the graphs encoder and backbone and refine, not"),
+        (lambda data: data["graphs"].pop("refine"), "has the graphs pfn and encoder and backbone and refine, not"),
         (lambda data: data.update(kind="pillar"), "`refine` belongs to kind pillar_refine"),
         (lambda data: data["pillar"].update(neck="sparse", active_cells="sub"), "`pillar` is not the one that"),
         (lambda data: data["spec"]["grid"].update(map="pooled"), "`spec` is not the one that"),
