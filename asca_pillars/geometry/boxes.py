@@ -189,6 +189,13 @@ class Ranges(NamedTuple):
         x, y, z = ((low + by, high + by) for (low, high), by in zip(self, by_m, strict=True))
         return Ranges(x, y, z)
 
+    def inside(self, points: NDArray[np.floating]) -> NDArray[np.bool_]:
+        """Return the mask (N,) of the points (N, >=3), metres, LiDAR frame, within the ranges."""
+        inside = np.ones(len(points), bool)
+        for axis, (low, high) in enumerate(self):
+            inside &= (points[:, axis] >= low) & (points[:, axis] < high)
+        return inside
+
     def behind(self, points: NDArray[np.floating]) -> NDArray[np.bool_]:
         """Return the mask (N,) of points (N, >=2), metres, LiDAR frame, in directions that the detector does not cover.
 

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from asca_pillars.base.errors import ConfigError
 from asca_pillars.base.strict import Strict
-from asca_pillars.detection.detections import ScanCounts
 from asca_pillars.geometry.boxes import Floating, Mask, Ranges, Singles
 from asca_pillars.scans.mounting import Mounting
 
@@ -77,19 +76,20 @@ class InputWarning(NamedTuple):
 
 def check_input(
     points: Singles,
-    counts: ScanCounts,
+    ranges: Ranges,
     expected: ExpectedInput,
     mounting: Mounting | None = None,
-    model_ranges: Ranges | None = None,
+    *,
+    around: bool = False,
 ) -> list[InputWarning]:
     """Compare a scan with the training scans, and with where the detector looks.
 
     Args:
         points: (N, 4) finite x, y, z in metres, model's frame, and reflectance.
-        counts: points inside and outside the detector's grid.
+        ranges: where the detector looks.
         expected: statistics of the training scans.
         mounting: the mounting by which the points came into that frame.
-        model_ranges: the detector's ranges; None: every direction.
+        around: whether the detector looks in every direction.
     """
     mounting = mounting or Mounting()
     fewest, most = expected.points_per_scan
@@ -107,15 +107,15 @@ def check_input(
         warnings.append(InputWarning(axes.about, f"{axes.text}: {_axes_remedy(axes.axes, mounting)}"))
     if axes is None or axes.about not in ("upside down", "tilt"):  # otherwise the height is meaningless
         warnings.append(_height_warning(ground, expected, mounting))
-    if counts.points_outside > OUTSIDE_SHARE * counts.points and axes is None:
-        share = 100 * counts.points_outside / counts.points
+    outside = 1 - float(ranges.inside(sample).mean())
+    if outside > OUTSIDE_SHARE and axes is None:
         text = (
-            f"{share:.1f} % of the points lie outside the grid, where x is forward, y left, z up, in metres: "
+            f"{100 * outside:.1f} % of the points lie outside the grid, where x is forward, y left, z up, in metres: "
             "state other axes (--axes)"
         )
         warnings.append(InputWarning("range", text))
-    elif model_ranges is not None:
-        warnings.append(_behind_warning(sample[::_FRAME_STEP], model_ranges))
+    elif not around:
+        warnings.append(_behind_warning(sample[::_FRAME_STEP], ranges))
     return [warning for warning in warnings if warning]
 
 

@@ -5,8 +5,10 @@ A bundle's family decides which pipeline is opened.
 
 import logging
 import weakref
-from collections.abc import Generator, Iterable, Mapping
+from collections.abc import Callable, Generator, Iterable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import fields, replace
+from functools import partial
 from pathlib import Path
 from time import perf_counter
 from typing import Any, Literal, NamedTuple, TypeAlias, get_args
@@ -181,6 +183,7 @@ class Detector:
             self._turns = turns_around(self.spec.ranges, camera_view=expected.camera_view)
         self._ranges = ranges_around(self.spec.ranges, self.passes)
         self._warned: set[str] = set()
+        self._executor = ThreadPoolExecutor(1) if self.threads > 1 else None
         self.made_by = {
             "model": self.bundle.name,
             "weights_sha256": weights_digest(self.bundle),
@@ -288,17 +291,22 @@ class Detector:
         return _Frame(start, [("input", perf_counter())], usable, turns, [], warnings, points)
 
     def _prepare(self, frame: _Frame, turn: FrameChange) -> Any:
-        """Prepare one pass for the slowest network; in the first pass, check the scan against the expected input."""
+        """Prepare one pass for the slowest network; beside the first, check the scan against the expected input."""
         points = frame.usable.points if turn.is_identity else turn.points(frame.usable.points)
         frame.stage_times.append(("input", perf_counter()))
+        checked = None if frame.counts else self._check(frame.usable.unclipped)
         prepared = self.pipeline.prepare(points, frame.stage_times)
-        if not frame.counts:
-            expected, model_ranges = self.bundle.expected_input, self.spec.ranges if self.view == "ahead" else None
-            warnings = check_input(frame.usable.unclipped, prepared.counts, expected, self.mounting, model_ranges)
-            frame.warnings[:0] = warnings
+        if checked is not None:
+            frame.warnings[:0] = checked()
             frame.stage_times.append(("input", perf_counter()))
         frame.counts.append(prepared.counts)
         return prepared
+
+    def _check(self, points: NDArray[np.float32]) -> Callable[[], list[InputWarning]]:
+        """Return what gives the scan's warnings; with two threads or more, another core finds them meanwhile."""
+        expected, around = self.bundle.expected_input, self.view == "around"
+        check = partial(check_input, points, self._ranges, expected, self.mounting, around=around)
+        return self._executor.submit(check).result if self._executor else check
 
     def _finish(self, frame: _Frame, raw: list[Any]) -> ScanDetections:
         passes = [self.pipeline.finish(outputs, frame.stage_times) for outputs in raw]

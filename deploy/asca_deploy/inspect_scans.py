@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from asca_deploy.around import ranges_around, turns_around, widen_ranges
 from asca_deploy.detect_scans import repairs_of
@@ -19,7 +18,6 @@ from asca_pillars.base.errors import ConfigError, ScanError
 from asca_pillars.base.installation import require
 from asca_pillars.base.progress import Progress, Reporter
 from asca_pillars.data.inspection.inspect_dataset import Spread, spread
-from asca_pillars.detection.detections import ScanCounts
 from asca_pillars.geometry.boxes import Ranges
 from asca_pillars.geometry.frame_change import FrameChange
 from asca_pillars.scans.find_scans import name_scans
@@ -275,24 +273,15 @@ class _Measured:
     def add(self, name: str, scan: Scan) -> None:
         """Measure one more scan."""
         points = usable_points(scan.points, self._to_model).unclipped
-        inside = _count_inside(points, self._ranges)
-        counts = ScanCounts(len(points), len(points) - inside, 0)
-        warnings = check_input(points, counts, self._expected, self._mounting, self._ranges)
+        warnings = check_input(points, self._ranges, self._expected, self._mounting)
         self.notes.append((name, scan.notes, tuple(warning.text for warning in warnings)))
         self.points.append(len(points))
         if not len(points):
             return
         self.reflectance.append(float(points[:, 3].mean(dtype=np.float64)))
-        self.inside.append(inside / len(points))
+        self.inside.append(float(self._ranges.inside(points).mean()))
         if (ground := ground_z_m(points)) is not None:
             self.ground_z_m.append(ground)
-
-
-def _count_inside(points: NDArray[np.float32], ranges: Ranges) -> int:
-    inside = np.ones(len(points), bool)
-    for axis, (low, high) in enumerate(ranges):
-        inside &= (points[:, axis] >= low) & (points[:, axis] < high)
-    return int(np.count_nonzero(inside))
 
 
 def _scan_times(times: Sequence[tuple[int, int]]) -> ScanTimes:

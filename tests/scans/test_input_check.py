@@ -15,7 +15,6 @@ from asca_pillars.base.errors import ConfigError
 from asca_pillars.geometry.boxes import Ranges
 from asca_pillars.geometry.frame_change import FrameChange
 from asca_pillars.ops.pillar.grid import PillarGrid
-from asca_pillars.ops.pillar.prepare import PillarLimits, pillarize
 from asca_pillars.scans.input_check import (
     ExpectedInput,
     InputWarning,
@@ -47,7 +46,7 @@ def check(points: Points, expected: ExpectedInput = EXPECTED, mounting: Mounting
     """As the detector does it: the points are brought into the model's frame before."""
     mounting = mounting or Mounting()
     points = mounting.to_model(expected.sensor_height_m).points(points)
-    return check_input(points, pillarize(points, GRID, PillarLimits()).stats, expected, mounting)
+    return check_input(points, GRID.ranges, expected, mounting, around=True)
 
 
 def test_scans_like_the_training_scans_raise_no_alarm() -> None:
@@ -205,8 +204,8 @@ AHEAD = Ranges((0.0, 69.12), (-30.72, 30.72), (-3.0, 1.0))
 
 def told_to_look_around(points: Points, model_ranges: Ranges | None = AHEAD, axes: str = "x-forward") -> bool:
     points = Mounting(axes=axes).level.inverse.points(points)
-    counts = pillarize(points, GRID, PillarLimits()).stats
-    texts = {warning.about: warning.text for warning in check_input(points, counts, EXPECTED, None, model_ranges)}
+    warnings = check_input(points, model_ranges or GRID.ranges, EXPECTED, around=model_ranges is None)
+    texts = {warning.about: warning.text for warning in warnings}
     assert "view" not in texts or "(--around)" in texts["view"]
     return "view" in texts
 
