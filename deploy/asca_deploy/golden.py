@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from asca_deploy.bundle import PillarBundle
 from asca_deploy.detector import Detector
+from asca_deploy.pillar.encoder import PILLAR_MAXIMA
 from asca_deploy.pillar.graphs import HeadOutputs
 from asca_deploy.pillar.pipeline import Canvas, PillarPipeline
 from asca_deploy.two_stage.pipeline import RefinePipeline, refine_inputs
@@ -73,10 +74,10 @@ def write_golden(out: Path, bundle: str | Path | None, scan: Path) -> Stages:
 def golden_stages(pipeline: PillarPipeline | RefinePipeline, points: NDArray[np.float32]) -> Stages:
     """Return the arrays of each stage, by stage and name, for finite points (N, 4), metres, reflectance within 0..1.
 
-    Stages, for M points in P pillars: `input`, `pillarize`, `encode`, `scatter` (or `rulebooks` of a sparse neck),
-    `neck+head`, `decode` (n boxes that enter suppression) and `suppress` (those that are reported). With a second
-    stage, after `neck+head`: `propose`, `neighbors`, `refine` and `suppress`. Maps are channels last, as the graph
-    gives them.
+    Stages, for M points in P pillars: `input`, `pillarize`, `pfn` (where it has a graph), `encode`, `scatter` (or
+    `rulebooks` of a sparse neck), `neck+head`, `decode` (n boxes that enter suppression) and `suppress` (those that are
+    reported). With a second stage, after `neck+head`: `propose`, `neighbors`, `refine` and `suppress`. Maps are
+    channels last, as the graph gives them.
     """
     first = pipeline if isinstance(pipeline, PillarPipeline) else pipeline.first
     pillars = first.pillarize(points)
@@ -90,6 +91,7 @@ def golden_stages(pipeline: PillarPipeline | RefinePipeline, points: NDArray[np.
             "point_counts": pillars.point_counts,
             "cells": pillars.cells,
         },
+        **({} if first.encode.pfn is None else {"pfn": {PILLAR_MAXIMA: first.encode.maxima(pillars)}}),
         "encode": {"pillar_features": features},
         # Before the canvas is used for the next scan.
         ("scatter" if first.bundle.pillar.neck == "dense" else "rulebooks"): _placed(placed),

@@ -187,7 +187,7 @@ def pfn_maxima(features: _Floats, point_counts: _Integers, weight: _Floats, bias
         (P, C)
     """
     maxima = np.empty((len(point_counts), len(bias)), np.float32)
-    _pfn_maxima(features, point_counts, weight.reshape(-1), bias, maxima)
+    _pfn_maxima(features, point_counts, weight.reshape(9 * len(bias)), bias, maxima)
     return maxima
 
 

@@ -10,11 +10,13 @@ from pathlib import Path
 
 import numpy as np
 import onnx
+import onnxruntime
 import pytest
 import torch
 from numpy.typing import NDArray
 
 from asca_deploy import Detector
+from asca_deploy.golden import golden_stages
 from asca_deploy.manifest import load_pillar_bundle
 from asca_deploy.pillar.encoder import PILLAR_MAXIMA, pfn_inputs
 from asca_deploy.pillar.pipeline import PillarPipeline
@@ -115,6 +117,17 @@ def test_pfn_graph_gives_the_same_maxima_every_time(exported: Exports) -> None:
     first = maxima()
     assert all(np.array_equal(maxima(), first) for _ in range(300))
     np.testing.assert_allclose(pipeline.encode.maxima(pillars), first, rtol=1e-5, atol=1e-5)
+
+
+def test_golden_vectors_have_the_maxima_that_the_pfn_graph_gives(exported: Exports) -> None:
+    pipeline = Detector(exported("channel"), threads=1).pipeline
+    assert isinstance(pipeline, PillarPipeline)
+    stages = golden_stages(pipeline, SCANS[0])
+    assert list(stages)[1:4] == ["pillarize", "pfn", "encode"]
+    pfn = onnxruntime.InferenceSession(exported("channel") / "pfn.onnx", providers=["CPUExecutionProvider"])
+    given = {name: stages["pillarize"][name] for name in ("features", "pillar_index", "point_counts")}
+    (maxima,) = pfn.run([PILLAR_MAXIMA], given)
+    np.testing.assert_allclose(stages["pfn"][PILLAR_MAXIMA], maxima, rtol=1e-5, atol=1e-5)
 
 
 def test_a_pfn_graph_that_other_runtimes_would_run_differently_is_refused(
