@@ -18,7 +18,7 @@ Box: (x, y, z, length, width, height, yaw), one row of an (N, 7) array.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -177,6 +177,19 @@ def decode_boxes(
     return boxes
 
 
+def within(
+    points: NDArray[np.floating], ranges: Iterable[tuple[float, float]] | NDArray[np.floating]
+) -> NDArray[np.bool_]:
+    """Return the mask (N,) of the points or boxes (N, >= axes) within (lowest, highest) of each axis, in turn.
+
+    The lowest is inside, the highest is not. Values that are not finite are outside.
+    """
+    inside = np.ones(len(points), bool)
+    for axis, (low, high) in enumerate(ranges):
+        inside &= (points[:, axis] >= low) & (points[:, axis] < high)
+    return inside
+
+
 class Ranges(NamedTuple):
     """(lowest, highest) along each axis in metres, LiDAR frame; the lowest is inside, the highest is not."""
 
@@ -188,13 +201,6 @@ class Ranges(NamedTuple):
         """Return the ranges translated by (3,) metres."""
         x, y, z = ((low + by, high + by) for (low, high), by in zip(self, by_m, strict=True))
         return Ranges(x, y, z)
-
-    def inside(self, points: NDArray[np.floating]) -> NDArray[np.bool_]:
-        """Return the mask (N,) of the points (N, >=3), metres, LiDAR frame, within the ranges."""
-        inside = np.ones(len(points), bool)
-        for axis, (low, high) in enumerate(self):
-            inside &= (points[:, axis] >= low) & (points[:, axis] < high)
-        return inside
 
     def behind(self, points: NDArray[np.floating]) -> NDArray[np.bool_]:
         """Return the mask (N,) of points (N, >=2), metres, LiDAR frame, in directions that the detector does not cover.
@@ -208,5 +214,4 @@ class Ranges(NamedTuple):
 
     def hold_centers(self, boxes: NDArray[np.floating]) -> NDArray[np.bool_]:
         """Return the mask (N,) of the boxes (N, 7), metres, LiDAR frame, whose center is inside in bird's-eye view."""
-        x, y = boxes[:, 0], boxes[:, 1]
-        return np.asarray((x >= self.x_m[0]) & (x < self.x_m[1]) & (y >= self.y_m[0]) & (y < self.y_m[1]))
+        return within(boxes, self[:2])

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from asca_pillars.base.errors import ConfigError
 from asca_pillars.base.strict import Strict
-from asca_pillars.geometry.boxes import Floating, Mask, Ranges, Singles
+from asca_pillars.geometry.boxes import Floating, Mask, Ranges, Singles, within
 from asca_pillars.scans.mounting import Mounting
 
 _HIGHEST_M = 100.0  # larger heights of the ground are not plausible
@@ -107,7 +107,7 @@ def check_input(
         warnings.append(InputWarning(axes.about, f"{axes.text}: {_axes_remedy(axes.axes, mounting)}"))
     if axes is None or axes.about not in ("upside down", "tilt"):  # otherwise the height is meaningless
         warnings.append(_height_warning(ground, expected, mounting))
-    outside = 1 - float(ranges.inside(sample).mean())
+    outside = 1 - float(within(sample, ranges).mean())
     if outside > OUTSIDE_SHARE and axes is None:
         text = (
             f"{100 * outside:.1f} % of the points lie outside the grid, where x is forward, y left, z up, in metres: "

@@ -18,7 +18,7 @@ from asca_pillars.base.errors import ConfigError, ScanError
 from asca_pillars.base.installation import require
 from asca_pillars.base.progress import Progress, Reporter
 from asca_pillars.data.inspection.inspect_dataset import Spread, spread
-from asca_pillars.geometry.boxes import Ranges
+from asca_pillars.geometry.boxes import Ranges, within
 from asca_pillars.geometry.frame_change import FrameChange
 from asca_pillars.scans.find_scans import name_scans
 from asca_pillars.scans.ground_height import HeightEstimate, NamedPoints
@@ -279,7 +279,7 @@ class _Measured:
         if not len(points):
             return
         self.reflectance.append(float(points[:, 3].mean(dtype=np.float64)))
-        self.inside.append(float(self._ranges.inside(points).mean()))
+        self.inside.append(float(within(points, self._ranges).mean()))
         if (ground := ground_z_m(points)) is not None:
             self.ground_z_m.append(ground)
 

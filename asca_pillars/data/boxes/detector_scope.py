@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_pillars.detection.spec import DetectorSpec
+from asca_pillars.geometry.boxes import within
 
 Interval = tuple[float, float]
 
@@ -23,10 +24,7 @@ class DetectorScope(NamedTuple):
 
     def holds(self, boxes: NDArray[np.floating]) -> NDArray[np.bool_]:
         """Return the mask (N,) of the boxes (N, 7), m and rad, level axes, whose center is within the ranges."""
-        inside = np.ones(len(boxes), bool)
-        for axis, (low, high) in enumerate(self.ranges_m or ()):
-            inside &= (boxes[:, axis] >= low) & (boxes[:, axis] < high)
-        return inside
+        return within(boxes, self.ranges_m or ())
 
     def where(self) -> str:
         """Return the ranges in words."""

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from asca_pillars.base.errors import ConfigError
 from asca_pillars.base.strict import Strict
-from asca_pillars.geometry.boxes import Ranges
+from asca_pillars.geometry.boxes import Ranges, within
 
 __all__ = ["HEAD_STRIDE", "NECK_STRIDE", "PillarGrid"]
 
@@ -170,10 +170,7 @@ class PillarGrid(Strict):
             raise ValueError(f"points must have shape (N, >=3), not {points.shape}")
         xyz = points[:, :3].astype(np.float32, copy=False)
         cells = np.full(len(points), -1, np.int64)
-        inside = np.ones(len(points), bool)
-        for axis, (low, high) in enumerate(self.tables.ranges_m):
-            inside &= (xyz[:, axis] >= low) & (xyz[:, axis] < high)
-        chosen = np.flatnonzero(inside)
+        chosen = np.flatnonzero(within(xyz, self.tables.ranges_m))
         slices = _interval(xyz[chosen, 0], self.tables.slice_edges_m)
         rows = _interval(xyz[chosen, 1], self.tables.row_edges_m)
         cells[chosen] = rows * self.nx + self.tables.column_of_slice[slices]

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from asca_pillars.base.errors import ConfigError
 from asca_pillars.base.kernels import load_kernels
 from asca_pillars.base.strict import Strict
+from asca_pillars.geometry.boxes import within
 from asca_pillars.ops.sparse.rulebooks import MAX_Z_CELLS, CellMap, Shape
 
 KERNELS = "asca_pillars.ops.pv_rcnn.kernels"
@@ -110,8 +111,7 @@ class VoxelGrid(Strict):
 
     def inside(self, points: NDArray[np.float32]) -> NDArray[np.bool_]:
         """Return a mask (M,) of the points (M, >= 3), metres, LiDAR frame, that lie in a voxel."""
-        lows_m, highs_m = (np.array(ends, np.float32) for ends in zip(*self.ranges_m, strict=True))
-        return np.asarray(((points[:, :3] >= lows_m) & (points[:, :3] < highs_m)).all(axis=1))
+        return within(points, np.array(self.ranges_m, np.float32))
 
 
 class Voxels(NamedTuple):
