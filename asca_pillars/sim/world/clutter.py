@@ -8,6 +8,7 @@ import numpy as np
 
 from asca_pillars.sim.bodies.people import motorbike_body, parked_bicycle_body
 from asca_pillars.sim.world.builder import Builder, Material
+from asca_pillars.sim.world.distractors import distractor
 from asca_pillars.sim.world.furniture import (
     barrier_boards,
     beacon,
@@ -181,12 +182,12 @@ def scatter(builder: Builder) -> None:
         elif rng.random() < 0.07:  # between parked cars, as planted build-outs of the kerb are
             lateral = -rng.uniform(0.3, 1.8)
         if not builder.near_junction(along, along):
-            things[bisect_left(upto, rng.random())](builder, along, float(side * (edge + lateral)))
+            _add(builder, things[bisect_left(upto, rng.random())], along, float(side * (edge + lateral)))
     for _ in range(rng.poisson(builder.config.far_clutter)):
         along = float(rng.choice([-1.0, 1.0]) * rng.uniform(28.0, 75.0))
         across = float(rng.choice([-1.0, 1.0]) * (ground.half_width_m + rng.uniform(0.0, 30.0)))
         if not builder.near_junction(along, along):
-            FAR[int(rng.integers(len(FAR)))](builder, along, across)
+            _add(builder, FAR[int(rng.integers(len(FAR)))], along, across)
     if ground.cross_half_m > 0 and rng.random() < 0.35:
         reach = ground.cross_half_m + rng.uniform(1.5, 5.0)
         island(builder, ground.cross_u_m + float(rng.choice([-1.0, 1.0])) * reach, 0.0)
@@ -311,4 +312,11 @@ def fill_gaps(builder: Builder, targets: Sequence[Target]) -> None:
 
 
 def _put(builder: Builder, things: Sequence[Thing], x: float, y: float) -> None:
-    things[int(builder.rng.integers(len(things)))](builder, *builder.ground.to_road(float(x), float(y)))
+    _add(builder, things[int(builder.rng.integers(len(things)))], *builder.ground.to_road(float(x), float(y)))
+
+
+def _add(builder: Builder, thing: Thing, along: float, across: float) -> None:
+    """Add the thing, or with the probability `distractor_share` a distractor instead."""
+    share = builder.config.distractor_share
+    # Drawn only where it is asked for: other configurations have the streets that they always had.
+    (distractor if share and builder.rng.random() < share else thing)(builder, along, across)

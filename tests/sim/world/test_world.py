@@ -1,5 +1,7 @@
 """The unlabelled world: bounds that hold over a handful of seeds, and what must never happen."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -8,8 +10,10 @@ from asca_pillars.sim.casting.groundcast import BALLAST, GROUND, RAIL, ground_ma
 from asca_pillars.sim.casting.raycast import Bodies, Hits, cast
 from asca_pillars.sim.lidar import Lidar, draw_firings
 from asca_pillars.sim.scene_config import SceneConfig
+from asca_pillars.sim.world import clutter
 from asca_pillars.sim.world.builder import Builder, Stretch
 from asca_pillars.sim.world.clutter import SHARES, scatter
+from asca_pillars.sim.world.distractors import distractor
 from asca_pillars.sim.world.ground import Ground, draw_relief, make_street
 from asca_pillars.sim.world.placement import Occupied
 from asca_pillars.sim.world.roadside import LININGS, building, close_view, line_streets
@@ -84,7 +88,7 @@ def test_every_kind_of_street_is_lined_and_cluttered(kind: str) -> None:
     assert set(LININGS) == set(KINDS)
 
 
-@pytest.mark.parametrize("thing", SHARES, ids=lambda thing: thing.__name__)
+@pytest.mark.parametrize("thing", [*SHARES, distractor], ids=lambda thing: thing.__name__)
 def test_every_thing_keeps_out_of_what_is_taken(thing) -> None:  # type: ignore[no-untyped-def]
     builder = builder_on(flat())
     builder.occupied = Occupied()
@@ -98,6 +102,45 @@ def test_every_thing_keeps_out_of_what_is_taken(thing) -> None:  # type: ignore[
     body = free.primitives()
     low = [part.min() for part in (body.triangles[..., 2].ravel(), body.centers[:, 2]) if part.size]
     assert low and -2.4 < min(low) < 0.5
+
+
+def test_as_many_things_are_distractors_as_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    distractors: list[float] = []
+    monkeypatch.setattr(clutter, "distractor", lambda builder, along, across: distractors.append(along))
+    things = dict.fromkeys(SHARES, 0)
+
+    def counted(thing):  # type: ignore[no-untyped-def]
+        def count(builder: Builder, along: float, across: float) -> None:
+            things[thing] += 1
+
+        return count
+
+    monkeypatch.setattr(clutter, "SHARES", {counted(thing): share for thing, share in SHARES.items()})
+    monkeypatch.setattr(clutter, "FAR", tuple(map(counted, clutter.FAR)))
+    for share in (0.0, 0.35, 1.0):
+        distractors.clear()
+        things = dict.fromkeys(SHARES, 0)
+        for seed in range(5):
+            builder = builder_on(flat(), seed=seed)
+            scatter(dataclasses.replace(builder, config=SceneConfig(distractor_share=share)))
+        count = sum(things.values()) + len(distractors)
+        assert count > 300
+        assert len(distractors) == pytest.approx(share * count, abs=0 if share in (0, 1) else 0.06 * count)
+
+
+def test_distractors_are_as_large_as_a_person_and_differ() -> None:
+    tall = []
+    for seed in range(40):
+        builder = builder_on(flat(), seed=seed)
+        distractor(builder, 9.0, 6.0)
+        _, points = scan(builder.primitives())
+        near = np.hypot(points[:, 0] - 9.0, points[:, 1] - 6.0) < 0.65
+        heights = points[near, 2] + 1.73
+        if len(heights) > 20:
+            tall.append(np.percentile(heights, 90))
+    assert len(tall) > 30
+    assert np.percentile(tall, 5) > 0.6 and np.percentile(tall, 80) < 2.4
+    assert np.std(tall) > 0.3
 
 
 def test_rays_go_into_woods_and_through_shrubs() -> None:
