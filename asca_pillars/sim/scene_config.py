@@ -105,7 +105,7 @@ class SceneConfig(Strict):
 
     clutter: tuple[float, float] = (15.0, 60.0)  # posts, signs, bins, shrubs and the like per 100 m of street
     far_clutter: float = 30.0  # mean number of low and sparse objects farther than 28 m, ahead and behind
-    distractor_share: float = 0.0  # fraction of all these that are random compositions as large as a person instead
+    distractor_share: float = 0.0  # fraction of clutter that random compositions as large as a person replace
     behind_gaps: float = 0.4  # fraction of vehicles with a narrow object behind their ends
     thick_trunks: float = 0.45  # fraction of trees with a trunk of 0.35 to 0.6 m that widens towards its roots
     crown_density_per_m: tuple[float, float] = (0.15, 1.8)

@@ -7,7 +7,6 @@ import numpy as np
 
 from asca_pillars.sim.world.builder import Builder, Material
 
-_PIECES = (1, 6)
 _LEAFY, _FLOATING, _ON_A_POST, _GOES_ON, _BEFORE_A_WALL = 0.25, 0.4, 0.6, 0.2, 0.3  # probabilities
 
 
@@ -24,7 +23,7 @@ def distractor(builder: Builder, along: float, across: float) -> None:
     foot = float(rng.uniform(0.15, 0.75)) * top if rng.random() < _FLOATING else 0.0
     shared = _surface(builder) if rng.random() < 0.6 else None
     leafy = rng.random() < _LEAFY
-    pieces = int(rng.integers(_PIECES[0], _PIECES[1] + 1))
+    pieces = int(rng.integers(1, 7))
     shares = (0.2, 1.0) if pieces > 1 else (1.0, 1.0)
     for number in range(pieces):
         tall = (top - foot) * float(rng.uniform(*shares))
