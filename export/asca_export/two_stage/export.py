@@ -28,6 +28,7 @@ from asca_export.two_stage.first_stage import (
     BundleFirstStage,
     add_neck_output,
     add_neck_steps,
+    halve_matrices,
     is_checkpoint,
     open_exported,
     scale_bev,
@@ -105,7 +106,7 @@ def export_refine_bundle(
 
     The first stage is the one that the checkpoint was trained on. With `options.calibration` it then gives way to its
     8-bit form: of a bundle the one named like it with `_int8`, of a checkpoint one made on those scans. The second
-    stage stays in float32.
+    stage still computes in float32, from matrices stored in 16 bits.
 
     Expected input is the first stage's, if that knows its training scans: it reads the whole scan, and the second stage
     only what lies around its boxes. So two stages look around in one pass if the first one was trained on revolutions.
@@ -195,7 +196,8 @@ def _to_int8(
     backbone, step = add_neck_steps(onnx.load(eight_bit / proposing.graphs[BACKBONE].file))
     onnx.save(backbone, graphs.graph_path(folder, BACKBONE))
     refine = graphs.graph_path(folder, REFINE)
-    onnx.save(scale_bev(onnx.load(refine), _neck_gains(*stages, calibration) * np.float32(step)), refine)
+    scaled = scale_bev(onnx.load(refine), _neck_gains(*stages, calibration) * np.float32(step))
+    onnx.save(halve_matrices(scaled), refine)
     report = dataclasses.replace(proposing.quantization, compared_scans=len(scans), logit_rms_error=error)
     return write_quantized(folder, dataclasses.replace(bundle, pillar=proposing.pillar), report, expected, scans)
 

@@ -1,11 +1,11 @@
-"""The head's input as an output, in float32 and in steps."""
+"""The head's input as an output, in float32 and in steps; how the second stage reads and stores what it has."""
 
 import numpy as np
 import onnx
 import onnxruntime
 import pytest
 
-from asca_export.two_stage.first_stage import add_neck_output, add_neck_steps, scale_bev
+from asca_export.two_stage.first_stage import add_neck_output, add_neck_steps, halve_matrices, scale_bev
 
 
 def run(model: onnx.ModelProto, **inputs: np.ndarray) -> np.ndarray:
@@ -42,3 +42,20 @@ def test_the_second_stage_scales_what_it_reads() -> None:
     scaled = scale_bev(refine, np.array([1, 2, 0.5], np.float32))
     assert run(scaled, bev=np.full((2, 3), 4, np.float32)).tolist() == [[-4, -8, -2]] * 2
     assert run(refine, bev=np.ones((1, 3), np.float32)).tolist() == [[-1] * 3], "the other one stays as it is"
+
+
+def test_large_matrices_are_stored_in_half_and_small_ones_as_they_are() -> None:
+    rng = np.random.default_rng(0)
+    matrices = {"large": rng.normal(size=(64, 80)), "small": rng.normal(size=(80, 8))}
+    stored = [onnx.numpy_helper.from_array(value.astype(np.float32), name) for name, value in matrices.items()]
+    x, y = (onnx.helper.make_tensor_value_info(*pair) for pair in (("x", 1, ["n", 64]), ("y", 1, ["n", 8])))
+    nodes = [onnx.helper.make_node("MatMul", names, [to]) for *names, to in (("x", "large", "z"), ("z", "small", "y"))]
+    graph = onnx.helper.make_graph(nodes, "refine", [x], [y], stored)
+    refine = onnx.helper.make_model(graph, opset_imports=[onnx.helper.make_opsetid("", 20)], ir_version=10)
+    halved = halve_matrices(refine)
+    assert len(halved.SerializeToString()) < 0.7 * len(refine.SerializeToString())
+    values = rng.normal(size=(3, 64)).astype(np.float32)
+    rounded = matrices["large"].astype(np.float16).astype(np.float32)
+    expected = values @ rounded @ matrices["small"].astype(np.float32)
+    np.testing.assert_allclose(run(halved, x=values), expected, rtol=1e-4, atol=1e-4)
+    np.testing.assert_allclose(run(refine, x=values), expected, rtol=0.1, atol=0.1)
