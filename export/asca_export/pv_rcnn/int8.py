@@ -24,7 +24,7 @@ from asca_export.graphs import graph_path
 from asca_export.int8 import Points, RoundedMaps, calibration_scans, logit_error, sweep, write_quantized
 from asca_export.pv_rcnn.graphs import RoundedVoxels, VoxelSample
 from asca_export.quantize import STEPS
-from asca_export.two_stage.first_stage import scale_bev
+from asca_export.two_stage.graphs import scale_bev
 from asca_pillars.base.errors import ExportError
 from asca_pillars.config.pv_rcnn import PvRcnnModel
 from asca_pillars.models.pv_rcnn.layers import PvRcnn

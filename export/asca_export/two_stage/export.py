@@ -28,12 +28,10 @@ from asca_export.two_stage.first_stage import (
     BundleFirstStage,
     add_neck_output,
     add_neck_steps,
-    halve_matrices,
     is_checkpoint,
     open_exported,
-    scale_bev,
 )
-from asca_export.two_stage.graphs import export_refine
+from asca_export.two_stage.graphs import export_refine, halve_matrices, scale_bev
 from asca_pillars.base.errors import ExportError
 from asca_pillars.base.files import atomic_directory
 from asca_pillars.base.system import default_threads

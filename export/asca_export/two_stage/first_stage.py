@@ -61,38 +61,6 @@ def add_neck_steps(backbone: onnx.ModelProto) -> tuple[onnx.ModelProto, float]:
     return model, float(step)
 
 
-def scale_bev(refine: onnx.ModelProto, factors: NDArray[np.float32]) -> onnx.ModelProto:
-    """Return a copy of the second stage's graph whose input `bev` is multiplied by `factors` (C,) first."""
-    model = onnx.ModelProto()
-    model.CopyFrom(refine)
-    for node in model.graph.node:
-        node.input[:] = ["bev.values" if name == "bev" else name for name in node.input]
-    model.graph.initializer.append(numpy_helper.from_array(factors, "bev.factors"))
-    model.graph.node.insert(0, helper.make_node("Mul", ["bev", "bev.factors"], ["bev.values"], name="bev.values"))
-    onnx.checker.check_model(model)
-    return model
-
-
-_LARGE = 4096  # weights; the small matrices multiply positions, which rounded weights would move by centimetres
-
-
-def halve_matrices(refine: onnx.ModelProto) -> onnx.ModelProto:
-    """Return a copy of the second stage's graph whose large matrices are stored as float16.
-
-    The runtime casts them back once, when it opens the graph, and computes in float32.
-    """
-    model = onnx.ModelProto()
-    model.CopyFrom(refine)
-    for tensor in model.graph.initializer:
-        values = numpy_helper.to_array(tensor)
-        if values.dtype == np.float32 and values.ndim == 2 and values.size >= _LARGE:
-            name = tensor.name
-            tensor.CopyFrom(numpy_helper.from_array(values.astype(np.float16), f"{name}.half"))
-            model.graph.node.insert(0, helper.make_node("Cast", [f"{name}.half"], [name], to=TensorProto.FLOAT))
-    onnx.checker.check_model(model)
-    return model
-
-
 def _with_output(backbone: onnx.ModelProto, elem_type: int) -> tuple[onnx.ModelProto, str, bool]:
     """Return a copy with a declared output NECK, the name of the head's input, and whether it is in floating point."""
     model = onnx.ModelProto()

@@ -1,10 +1,14 @@
-"""The second stage as an ONNX graph, in the forms that run fastest."""
+"""The second stage as an ONNX graph, in the forms that run fastest, and what 8 bits change in it."""
 
 import copy
 from pathlib import Path
 from typing import Any, TypeVar
 
+import numpy as np
+import onnx
 import torch
+from numpy.typing import NDArray
+from onnx import TensorProto, helper, numpy_helper
 from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812  (torch's own convention)
 from torch.nn.utils.fusion import fuse_linear_bn_eval
@@ -165,3 +169,35 @@ def export_refine(refiner: PillarRefiner, section: RefineSection, classes: int, 
             rows |= dict.fromkeys(group, group.queries)
     of_cells = dict.fromkeys(("grid_points", *(names.rows for names in _grids(settings))), settings.grid_size**3)
     export_row_graph(_Flat(refiner, settings, list(inputs)), path, inputs, rows, outputs, of_cells)
+
+
+def scale_bev(refine: onnx.ModelProto, factors: NDArray[np.float32]) -> onnx.ModelProto:
+    """Return a copy of the second stage's graph whose input `bev` is multiplied by `factors` (C,) first."""
+    model = onnx.ModelProto()
+    model.CopyFrom(refine)
+    for node in model.graph.node:
+        node.input[:] = ["bev.values" if name == "bev" else name for name in node.input]
+    model.graph.initializer.append(numpy_helper.from_array(factors, "bev.factors"))
+    model.graph.node.insert(0, helper.make_node("Mul", ["bev", "bev.factors"], ["bev.values"], name="bev.values"))
+    onnx.checker.check_model(model)
+    return model
+
+
+_LARGE = 4096  # weights; the small matrices multiply positions, which rounded weights would move by centimetres
+
+
+def halve_matrices(refine: onnx.ModelProto) -> onnx.ModelProto:
+    """Return a copy of the second stage's graph whose large matrices are stored as float16.
+
+    The runtime casts them back once, when it opens the graph, and computes in float32.
+    """
+    model = onnx.ModelProto()
+    model.CopyFrom(refine)
+    for tensor in model.graph.initializer:
+        values = numpy_helper.to_array(tensor)
+        if values.dtype == np.float32 and values.ndim == 2 and values.size >= _LARGE:
+            name = tensor.name
+            tensor.CopyFrom(numpy_helper.from_array(values.astype(np.float16), f"{name}.half"))
+            model.graph.node.insert(0, helper.make_node("Cast", [f"{name}.half"], [name], to=TensorProto.FLOAT))
+    onnx.checker.check_model(model)
+    return model

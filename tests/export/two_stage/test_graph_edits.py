@@ -1,11 +1,12 @@
-"""The head's input as an output, in float32 and in steps; how the second stage reads and stores what it has."""
+"""Edits of exported graphs: the head's input as an output; how the second stage reads and stores what it has."""
 
 import numpy as np
 import onnx
 import onnxruntime
 import pytest
 
-from asca_export.two_stage.first_stage import add_neck_output, add_neck_steps, halve_matrices, scale_bev
+from asca_export.two_stage.first_stage import add_neck_output, add_neck_steps
+from asca_export.two_stage.graphs import halve_matrices, scale_bev
 
 
 def run(model: onnx.ModelProto, **inputs: np.ndarray) -> np.ndarray:
