@@ -69,7 +69,7 @@ def test_commands_of_other_blocks_exist(name: str, block: Block) -> None:
         words = shlex.split(command, comments=True)
         if words[:1] != ["asca"]:
             continue
-        for option in (word for word in words[2:] if re.match("-+[a-z]", word)):  # and no negative number
+        for option in (word for word in words[2:] if re.match(r"-(?!\d)", word)):  # no negative numbers
             assert re.search(rf"(^|\s|│){re.escape(option)}\b", help_of(words[1])), f"{name}:{block.line}: {option}"
 
 
