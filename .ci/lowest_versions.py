@@ -51,7 +51,7 @@ BY_EXTRA = {
         ("asca", "detect", "data/training/velodyne/000000.bin", "-b", "bundle_int8", "--out", "int8"),
     ),
     "eval": (("asca", "eval", "--data", "data", "--out", "curves"),),
-    "import": (("asca", "detect", "sweep.feather", "--out", "feather"),),
+    "import": (("asca", "detect", "sweep.feather", "--out", "feather"), ("asca", "detect", "scan.laz", "--out", "laz")),
     "recordings": (
         ("asca", "detect", "drive.mcap", "--out", "mcap", "--foxglove", "boxes.mcap"),
         ("asca", "detect", "drive", "--out", "rosbag2"),
@@ -116,6 +116,12 @@ if "import" in sys.argv:
     columns = dict(zip(("x", "y", "z", "intensity"), points.T.astype(np.float32)))
     columns["intensity"] = (columns["intensity"] * 255).astype(np.uint8)
     feather.write_feather(pyarrow.table(columns), "sweep.feather")
+    import laspy
+    cloud = laspy.create(point_format=0, file_version="1.2")
+    cloud.header.scales = [0.001] * 3
+    cloud.x, cloud.y, cloud.z = points[:, :3].T
+    cloud.intensity = columns["intensity"]
+    cloud.write("scan.laz")
 if "recordings" in sys.argv:
     sys.path.insert(0, sys.argv[1])
     from benchmarks.made_recordings import write_recording

@@ -11,7 +11,9 @@ from asca_pillars.base.errors import ConfigError
 if TYPE_CHECKING:
     from asca_pillars.scans.scan_settings import ScanSettings
 
-_SCANS = "Scans (.bin .npy .pcd .ply .feather) and folders of them, searched to any depth"
+_SCANS = (
+    "Scans (.bin .npy .pcd .ply .las .laz .xyz .feather; .csv .txt by name) and folders of them, searched to any depth"
+)
 ScansArgument = Annotated[
     list[Path] | None, typer.Argument(help=f"{_SCANS}. Default: the sample that comes with asca.")
 ]

@@ -12,7 +12,9 @@ from typing import NamedTuple, TypeVar
 from asca_pillars.base.errors import ScanError
 from asca_pillars.base.files import is_hidden, require_content
 
-SCAN_SUFFIXES = (".bin", ".npy", ".pcd", ".ply", ".feather")
+SCAN_SUFFIXES = (".bin", ".npy", ".pcd", ".ply", ".las", ".laz", ".xyz", ".feather")
+NAMED_SUFFIXES = (".csv", ".txt")
+"""Of scans that are read where their files are named; in folders such files are labels, calibrations and lists."""
 PREPARED_FILE = "README.txt"
 PREPARED_NOTE = "Computed from the dataset by `asca prepare` or by a training run. Delete it when no run uses it.\n"
 """Text of the file that marks a folder computed from a dataset, which contains no scans."""
@@ -54,7 +56,10 @@ def find_scans(path: str | Path) -> list[Path]:
         raise ScanError(f"{path}: no such file or folder; check the path")
     scans = [entry for entry in files_below(path) if is_scan(entry.relative_to(path))]
     if not scans:
-        raise ScanError(f"{path}: no scans in this folder; scans are {', '.join(SCAN_SUFFIXES)}")
+        raise ScanError(
+            f"{path}: no scans in this folder; scans are {', '.join(SCAN_SUFFIXES)}; "
+            f"give {' and '.join(NAMED_SUFFIXES)} files by name"
+        )
     return sorted(scans, key=natural_order)
 
 

@@ -1,5 +1,6 @@
 """Points from records with named fields, which the PCD and PLY readers share, and from NumPy arrays."""
 
+import math
 import re
 import warnings
 from collections.abc import Sequence
@@ -135,7 +136,7 @@ _MANY_COLUMNS = 8
 
 
 def read_npy(path: Path) -> StoredPoints:
-    """Read the points of a NumPy array (N, 3 or more) of real numbers.
+    """Read the points of a NumPy array (N, 3 or more) of real numbers, or of records with the fields x, y and z.
 
     Raises:
         ScanError: not such an array, or a transposed one.
@@ -159,11 +160,14 @@ def read_npy(path: Path) -> StoredPoints:
 def points_from_array(array: NDArray[Any], source: str = "points") -> StoredPoints:
     """Convert an array (N, >=3) to points: x, y, z, and reflectance if there is a fourth column.
 
-    Points of a masked array with a masked coordinate or reflectance are left out; remarks give their number.
+    Records, a structured array of any shape, are read by the names of their fields, as a PCD is. Points of a masked
+    array with a masked coordinate or reflectance are left out; remarks give their number.
 
     Raises:
         ScanError: another shape, too many points, or not real numbers.
     """
+    if array.dtype.names is not None:
+        return _points_from_records(array, source)
     if array.ndim == 2 and array.shape[0] in (3, 4) and array.shape[1] > _MANY_COLUMNS:
         raise ScanError(f"{source}: of shape {array.shape}, points lie in its columns; transpose it (array.T)")
     if array.ndim != 2 or array.shape[1] < 3 or array.dtype.kind not in "iuf":
@@ -181,3 +185,17 @@ def points_from_array(array: NDArray[Any], source: str = "points") -> StoredPoin
         xyz = array[:, :3].astype(np.float32)
     reflectance = np.asarray(array[:, 3]) if array.shape[1] > 3 else None
     return StoredPoints(xyz, reflectance, array.dtype, remarks)
+
+
+def _points_from_records(array: NDArray[Any], source: str) -> StoredPoints:
+    """Convert a structured array to points, such as those that ros_numpy and pypcd4 give."""
+    types = [array.dtype[name] for name in array.dtype.names or ()]
+    fields = [
+        Field(name, kind.base, math.prod(kind.shape)) for name, kind in zip(array.dtype.names or (), types, strict=True)
+    ]
+    selected = [fields[index] for index in select_fields(source, fields)]
+    if wrong := [field for field in selected if field.dtype.kind not in "iuf"]:
+        raise ScanError(f"{source}: field {wrong[0].name} holds {wrong[0].dtype}; save real numbers")
+    if array.size > MAX_POINTS:
+        raise ScanError(f"{source}: {array.size} points are more than {MAX_POINTS}; cut the recording into scans")
+    return assemble_points(array.size, [array[field.name].reshape(-1) for field in selected], selected)

@@ -11,8 +11,10 @@ from numpy.typing import NDArray
 
 from asca_pillars.base.errors import ScanError
 from asca_pillars.base.files import atomic_path, require_content
+from asca_pillars.scans.delimited_text import read_delimited_text
 from asca_pillars.scans.feather import read_feather
-from asca_pillars.scans.find_scans import SCAN_SUFFIXES
+from asca_pillars.scans.find_scans import NAMED_SUFFIXES, SCAN_SUFFIXES
+from asca_pillars.scans.las import read_las
 from asca_pillars.scans.pcd import read_pcd
 from asca_pillars.scans.ply import read_ply
 from asca_pillars.scans.records import AGAIN, MAX_POINTS, StoredPoints, read_npy
@@ -62,7 +64,7 @@ class Scan(NamedTuple):
 
 
 def read_scan(path: str | Path, *, columns: int | None = None, reflectance_scale: ReflectanceScale = "auto") -> Scan:
-    """Read a scan by its suffix (`SCAN_SUFFIXES`).
+    """Read a scan by its suffix (`SCAN_SUFFIXES` and `NAMED_SUFFIXES`).
 
     A file without reflectance gets zeros. Points with a coordinate or reflectance that is not finite are dropped and
     counted. A well-formed file without points is an empty scan. At most MAX_POINTS points or MAX_FILE_BYTES are
@@ -107,7 +109,7 @@ def read_stored(path: Path, columns: int | None) -> StoredPoints:
     """
     reader = _READERS.get(path.suffix.lower())
     if reader is None:
-        raise ScanError(f"{path}: unknown suffix '{path.suffix}'; scans are {', '.join(SCAN_SUFFIXES)}")
+        raise ScanError(f"{path}: unknown suffix '{path.suffix}'; scans are {', '.join(_READERS)}")
     try:
         require_content(path, ScanError)
         size = path.stat().st_size
@@ -270,6 +272,11 @@ _READERS: dict[str, Callable[[Path], StoredPoints]] = {
     ".npy": read_npy,
     ".pcd": read_pcd,
     ".ply": read_ply,
+    ".las": read_las,
+    ".laz": read_las,
+    ".xyz": read_delimited_text,
     ".feather": read_feather,
+    ".csv": read_delimited_text,
+    ".txt": read_delimited_text,
 }
-assert tuple(_READERS) == SCAN_SUFFIXES, "find_scans finds what can be read"
+assert tuple(_READERS) == (*SCAN_SUFFIXES, *NAMED_SUFFIXES), "find_scans finds what can be read"

@@ -63,6 +63,24 @@ def ply(encoding: str, points=POINTS, *, kind="float") -> bytes:
     return header + body + records.astype(records.dtype.newbyteorder(order)).tobytes() + bytes(13)
 
 
+def las(points=POINTS) -> bytes:
+    """LAS 1.2 with points of format 0: coordinates in steps of 0.125 m from an offset, intensities of 0..255."""
+    header = struct.pack(
+        "<4sHHIHH8sBB32s32sHHHIIBHI5I3d3d6d",
+        *(b"LASF", 0, 0, 0, 0, 0, b"", 1, 2, b"", b"made by a test", 1, 2024, 227, 227, 0, 0, 20, len(points)),
+        *(len(points), 0, 0, 0, 0, 0.125, 0.125, 0.125, 8, 0, 0, *[0] * 6),
+    )
+    steps = np.round((points[:, :3] - [8, 0, 0]) / 0.125).astype(int)
+    intensities = np.round(points[:, 3] * 255).astype(int)
+    records = [struct.pack("<iiiHBBbBH", *xyz, i, 9, 1, 0, 0, 0) for xyz, i in zip(steps, intensities, strict=True)]
+    return header + b"".join(records)
+
+
+def text(separator: str = " ", first: str = "", points=POINTS) -> bytes:
+    """A line of x, y, z and reflectance for each point, below a first line."""
+    return (first + "".join(separator.join(map(str, row)) + "\n" for row in points.tolist())).encode()
+
+
 def npy(array: np.ndarray) -> bytes:
     header = str({"descr": array.dtype.str, "fortran_order": False, "shape": array.shape}).encode() + b"\n"
     return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(header)) + header + array.tobytes()

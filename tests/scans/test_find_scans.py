@@ -108,6 +108,7 @@ def test_what_is_no_scan_is_said_and_names_that_cannot_be_told_apart(tmp_path: P
         find_scans(tmp_path / "missing")
     with pytest.raises(ScanError, match="no scans in this folder"):
         find_scans(touch(tmp_path, "notes.txt"))
+    assert find_scans(tmp_path / "notes.txt") == [tmp_path / "notes.txt"], "what is named is read"
     touch(tmp_path, "p/x/1.bin", "q/x/1.bin")
     with pytest.raises(ScanError, match="would have one name"):
         name_scans([tmp_path / "p" / "x", tmp_path / "q" / "x"])

@@ -18,7 +18,7 @@ from asca_pillars.scans.ply import MAX_LISTS
 from asca_pillars.scans.records import points_from_array
 from asca_pillars.scans.scan_reader import decide_scale, read_scan, write_scan
 from asca_pillars.scans.scan_settings import folder_reflectance_scale
-from tests.scans.scan_files import POINTS, npy, pcd, ply, read
+from tests.scans.scan_files import POINTS, npy, pcd, ply, read, text
 
 FILES = {
     "a.bin": POINTS.astype("<f4").tobytes(),
@@ -30,6 +30,9 @@ FILES = {
     "ascii.ply": ply("ascii"),
     "little.ply": ply("binary_little_endian"),
     "big.ply": ply("binary_big_endian"),
+    "a.xyz": text(),
+    "a.csv": text(",", "x,y,z,intensity\n"),
+    "tabs.txt": text("\t", "//X (m)\tY (m)\tZ (m)\tReflectivity\n"),
 }
 BRIGHT = POINTS * np.array([1, 1, 1, 200], np.float32)
 
@@ -159,7 +162,7 @@ ASCII_PCD, ASCII_PLY = pcd("ascii"), ply("ascii")
     [
         ("a.bin", b"", "empty (0 bytes)"),
         ("a.bin", bytes(40), "file size (40 bytes) is not a multiple of 16"),
-        ("a.xyz", b"1 2 3", ", ".join(SCAN_SUFFIXES)),
+        ("a.e57", b"1 2 3", ", ".join(SCAN_SUFFIXES)),
         ("a.npy", npy(POINTS[:, 0].copy()), "(4,)"),
         ("a.npy", npy(POINTS)[:-1], "not an array of numbers"),
         ("a.npy", npy(np.array([["x"]], dtype=object)), "not an array of numbers"),
@@ -412,3 +415,29 @@ def test_python_says_nothing_of_a_damaged_npy_header(tmp_path):
 def test_arrays_on_their_side_or_of_other_things_than_real_numbers_are_refused(array, words):
     with pytest.raises(ScanError, match=words):
         points_from_array(array)
+
+
+@pytest.mark.parametrize("shape", [(4,), (2, 2)])
+def test_records_are_read_by_the_names_of_their_fields(tmp_path, shape):
+    records = np.zeros(
+        shape, [("ring", "u1"), ("z", "<f4"), ("y", ">f8"), ("rgb", "u1", 3), ("x", "<f4"), ("intensity", "u1")]
+    )
+    records["x"], records["y"], records["z"] = (POINTS[:, axis].reshape(shape) for axis in range(3))
+    records["intensity"] = [[0, 51], [102, 255]] if shape == (2, 2) else [0, 51, 102, 255]
+    np.save(tmp_path / "a.npy", records)
+    points = read_scan(tmp_path / "a.npy").points
+    np.testing.assert_array_equal(points[:, :3], POINTS[:, :3])
+    np.testing.assert_allclose(points[:, 3], [0, 0.2, 0.4, 1], rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("fields", "words"),
+    [
+        ([("x", "f4"), ("y", "f4")], "no field z among x, y"),
+        ([("x", "f4", 3), ("y", "f4"), ("z", "f4")], "x has 3 values per point"),
+        ([("x", "f4"), ("y", "f4"), ("z", "U3")], "field z holds <U3"),
+    ],
+)
+def test_records_without_coordinates_are_refused(fields, words):
+    with pytest.raises(ScanError, match=words):
+        points_from_array(np.zeros(3, fields))

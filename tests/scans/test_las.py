@@ -1,0 +1,69 @@
+"""LAS files written byte by byte, and LAZ files as laspy compresses them."""
+
+import io
+import sys
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from asca_pillars.base.errors import AscaError, ScanError
+from asca_pillars.scans import las as las_reader
+from tests.scans.scan_files import POINTS, las, read
+
+laspy = pytest.importorskip("laspy", reason="needs the extra `import`")
+
+
+def laz() -> bytes:
+    stream = io.BytesIO()
+    laspy.read(io.BytesIO(las())).write(stream, do_compress=True)
+    return stream.getvalue()
+
+
+@pytest.mark.parametrize(("name", "form"), [("a.las", las), ("A.LAZ", laz)])
+def test_points_and_intensities(tmp_path, name, form):
+    scan = read(tmp_path, name, form())
+    np.testing.assert_array_equal(scan.points[:, :3], POINTS[:, :3])
+    np.testing.assert_allclose(scan.points[:, 3], np.round(POINTS[:, 3] * 255) / 255, rtol=1e-6)
+    assert scan.notes.reflectance_scale == 255
+
+
+@pytest.mark.parametrize(("name", "form"), [("a.las", las), ("a.laz", laz)])
+def test_a_file_cut_anywhere_is_refused(tmp_path, name, form):
+    content = form()
+    for size in range(1, len(las()) if name == "a.las" else len(content) // 2, 7):
+        with pytest.raises(ScanError, match=name):
+            read(tmp_path, name, content[:size])
+
+
+@pytest.mark.parametrize(("name", "form"), [("a.las", las), ("a.laz", laz)])
+@settings(max_examples=60)
+@given(changes=st.lists(st.tuples(st.integers(0, 10_000), st.integers(0, 255)), min_size=1, max_size=4))
+def test_a_file_with_wrong_bytes_is_a_scan_or_a_scan_error(tmp_path_factory, name, form, changes):
+    content = bytearray(form())
+    for position, value in changes:
+        content[position % len(content)] = value
+    try:
+        assert read(tmp_path_factory.mktemp("fuzz"), name, bytes(content)).points.shape[1] == 4
+    except ScanError as error:
+        assert "\n" not in str(error)
+
+
+def test_a_header_of_more_records_than_the_file_holds_is_refused_at_once(tmp_path):
+    content = bytearray(las())
+    content[100:104] = b"\xff" * 4  # laspy would read records of nothing for minutes
+    with pytest.raises(ScanError, match="more records than the file holds"):
+        read(tmp_path, "a.las", bytes(content))
+
+
+def test_more_points_than_a_scan_has_are_refused_before_they_are_read(tmp_path, monkeypatch):
+    monkeypatch.setattr(las_reader, "MAX_POINTS", 3)
+    with pytest.raises(ScanError, match="4 points are more than 3"):
+        read(tmp_path, "a.las", las())
+
+
+def test_without_laspy_the_command_that_installs_it_is_named(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "laspy", None)
+    with pytest.raises(AscaError, match=r"laspy not installed: pip install .*import"):
+        read(tmp_path, "a.las", las())
