@@ -28,7 +28,12 @@ def read_las(path: Path) -> StoredPoints:
         raise ScanError(f"{path}: not the header of a LAS file, or one of more records than the file holds; {AGAIN}")
     try:
         with laspy.open(path) as reader:
-            count = reader.header.point_count
+            header, count = reader.header, reader.header.point_count
+            least = header.offset_to_point_data + (
+                0 if header.are_points_compressed else count * header.point_format.size
+            )
+            if least > path.stat().st_size:
+                raise ValueError(f"{count} points do not fit into it")
             points = reader.read() if count <= MAX_POINTS else None
     except (OSError, MemoryError):
         raise

@@ -108,11 +108,11 @@ def test_without_the_extras_commands_say_what_to_install(tmp_path: Path) -> None
 
 def test_detect_refuses_in_one_line(tmp_path: Path) -> None:
     (tmp_path / "detections").write_text("keep me")
-    for name in ("truncated.bin", "scan.las"):
+    for name in ("truncated.bin", "scan.e57"):
         (tmp_path / name).write_bytes(b"x")
     for arguments, message in (
         (("truncated.bin", "--out", "out"), "truncated.bin: file size (1 byte)"),
-        (("scan.las", "--out", "out"), "unknown suffix '.las'"),
+        (("scan.e57", "--out", "out"), "unknown suffix '.e57'"),
         (("none.bin", "--out", "out"), "no such file or folder"),
         (("--bundle", tmp_path), "bundle.json"),
         (("--provider", "gpu"), "unknown provider 'gpu'"),
