@@ -31,7 +31,7 @@ from asca_pillars.sim.simulation import load_simulation_config
 from benchmarks.made_recordings import TOPIC, TYPE, point_cloud2
 from tests.helpers.scenes import write_dataset
 from tests.scans.recordings.cloud_recordings import ODOMETRY, cloud_points, odometry_message, stamps, store
-from tests.scans.scan_files import POINTS, las, npy, pcd, ply, text
+from tests.scans.scan_files import POINTS, las, laz, npy, pcd, ply, text
 
 BOX = {"class": "Car", "x_m": 9.5, "y_m": -2, "z_m": -0.9, "length_m": 4, "width_m": 1.8, "height_m": 1.6, "yaw_rad": 3}
 METADATA = b"""rosbag2_bagfile_information:
@@ -165,6 +165,7 @@ def scan_seeds() -> dict[str, tuple[bytes, ...]]:
         "pcd": tuple(pcd(encoding) for encoding in ("ascii", "binary", "binary_compressed")),
         "ply": tuple(ply(encoding) for encoding in ("ascii", "binary_little_endian", "binary_big_endian")),
         "las": (las(),),
+        "laz": (laz(),),
         "csv": (text(), text(",", "x,y,z,intensity\n"), text(";", "# X (m);Y (m);Z (m);Reflectivity\n")),
     }
 

@@ -22,8 +22,8 @@ def adapt(
     scans: Annotated[
         Path,
         typer.Argument(
-            help="Folder of scans (.bin .npy .pcd .ply .las .laz .xyz .feather), or a recording (.mcap .db3 .bag .pcap, a "
-            "rosbag2 folder)."
+            help="Folder of scans (.bin .npy .pcd .ply .las .laz .xyz .feather), or a recording (.mcap .db3 .bag "
+            ".pcap, a rosbag2 folder)."
         ),
     ],
     *,

@@ -2,6 +2,7 @@
 
 import struct
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 
@@ -11,6 +12,8 @@ from asca_pillars.scans.records import AGAIN, MAX_POINTS, Field, StoredPoints, a
 
 _EARLIER_HEADER_BYTES, _HEADER_BYTES = 227, 375  # of LAS before and from version 1.4 on
 _VLR_BYTES, _EVLR_BYTES = 54, 60  # of a variable-length record's own header
+_COMPRESSED = 0x80  # in the point format
+_TABLE_AT_END = -1  # of a file written to a stream: the last eight bytes tell where the table of chunks is
 
 
 def read_las(path: Path) -> StoredPoints:
@@ -35,9 +38,9 @@ def read_las(path: Path) -> StoredPoints:
             if least > path.stat().st_size:
                 raise ValueError(f"{count} points do not fit into it")
             points = reader.read() if count <= MAX_POINTS else None
-    except (OSError, MemoryError):
+    except (OSError, MemoryError, KeyboardInterrupt):
         raise
-    except Exception as error:  # damage shows in errors of laspy, lazrs, struct and NumPy
+    except BaseException as error:  # damage shows in errors of laspy, struct and NumPy, and in panics of lazrs
         raise ScanError(f"{path}: not a readable LAS file ({' '.join(str(error).split())[:100]}); {AGAIN}") from error
     if points is None:
         raise ScanError(f"{path}: {count} points are more than {MAX_POINTS}; cut the recording into scans")
@@ -49,15 +52,31 @@ def read_las(path: Path) -> StoredPoints:
 
 
 def _records_fit(path: Path) -> bool:
-    """Return whether the variable-length records that the header states fit into the file.
+    """Return whether the file can hold the variable-length records and the compressed chunks that it states.
 
-    laspy reads as many as are stated, four billion in a damaged header, although nothing follows.
+    laspy reads as many records as are stated, four billion in a damaged header, although nothing follows, and lazrs
+    ends the process where there is no memory for so many chunks.
     """
+    size = path.stat().st_size
     with path.open("rb") as file:
         header = file.read(_HEADER_BYTES)
-    if header[:4] != b"LASF" or len(header) < _EARLIER_HEADER_BYTES:
-        return False
-    (records,) = struct.unpack_from("<I", header, 100)
-    is_1_4 = header[25] >= 4 and len(header) == _HEADER_BYTES
-    (extended,) = struct.unpack_from("<I", header, 243) if is_1_4 else (0,)
-    return records * _VLR_BYTES + extended * _EVLR_BYTES <= path.stat().st_size
+        if header[:4] != b"LASF" or len(header) < _EARLIER_HEADER_BYTES:
+            return False
+        start, records = struct.unpack_from("<2I", header, 96)
+        is_1_4 = header[25] >= 4 and len(header) == _HEADER_BYTES
+        (extended,) = struct.unpack_from("<I", header, 243) if is_1_4 else (0,)
+        chunks = _chunks(file, start, size) if header[104] & _COMPRESSED else 0
+    return records * _VLR_BYTES + extended * _EVLR_BYTES + chunks <= size
+
+
+def _chunks(file: BinaryIO, start: int, size: int) -> int:
+    """Return the number of chunks in the table to which the compressed points at `start`, or the last bytes, point."""
+    for place in (start, size - 8):
+        file.seek(max(place, 0))
+        (table,) = struct.unpack("<q", file.read(8).ljust(8, b"\0"))
+        if table != _TABLE_AT_END:
+            break
+    if not 0 <= table <= size:
+        return 0  # there is no table, as laspy will find
+    file.seek(table)
+    return int.from_bytes(file.read(8)[4:], "little")

@@ -1,5 +1,6 @@
 """Scans in the bytes of each format."""
 
+import io
 import struct
 from typing import Literal
 
@@ -74,6 +75,15 @@ def las(points=POINTS) -> bytes:
     intensities = np.round(points[:, 3] * 255).astype(int)
     records = [struct.pack("<iiiHBBbBH", *xyz, i, 9, 1, 0, 0, 0) for xyz, i in zip(steps, intensities, strict=True)]
     return header + b"".join(records)
+
+
+def laz() -> bytes:
+    """The same, as laspy compresses it."""
+    import laspy
+
+    stream = io.BytesIO()
+    laspy.read(io.BytesIO(las())).write(stream, do_compress=True)
+    return stream.getvalue()
 
 
 def text(separator: str = " ", first: str = "", points=POINTS) -> bytes:

@@ -1,6 +1,5 @@
 """LAS files written byte by byte, and LAZ files as laspy compresses them."""
 
-import io
 import sys
 
 import numpy as np
@@ -10,15 +9,9 @@ from hypothesis import strategies as st
 
 from asca_pillars.base.errors import AscaError, ScanError
 from asca_pillars.scans import las as las_reader
-from tests.scans.scan_files import POINTS, las, read
+from tests.scans.scan_files import POINTS, las, laz, read
 
-laspy = pytest.importorskip("laspy", reason="needs the extra `import`")
-
-
-def laz() -> bytes:
-    stream = io.BytesIO()
-    laspy.read(io.BytesIO(las())).write(stream, do_compress=True)
-    return stream.getvalue()
+pytest.importorskip("laspy", reason="needs the extra `import`")
 
 
 @pytest.mark.parametrize(("name", "form"), [("a.las", las), ("A.LAZ", laz)])
@@ -55,6 +48,15 @@ def test_a_header_of_more_records_than_the_file_holds_is_refused_at_once(tmp_pat
     content[100:104] = b"\xff" * 4  # laspy would read records of nothing for minutes
     with pytest.raises(ScanError, match="more records than the file holds"):
         read(tmp_path, "a.las", bytes(content))
+
+
+def test_a_table_of_more_chunks_than_the_file_holds_is_refused(tmp_path):
+    content = bytearray(laz())
+    start = int.from_bytes(content[96:100], "little")
+    table = int.from_bytes(content[start : start + 8], "little")
+    content[table + 4 : table + 8] = b"\xff" * 4  # lazrs would end the process for want of memory
+    with pytest.raises(ScanError, match="more records than the file holds"):
+        read(tmp_path, "a.laz", bytes(content))
 
 
 def test_more_points_than_a_scan_has_are_refused_before_they_are_read(tmp_path, monkeypatch):
