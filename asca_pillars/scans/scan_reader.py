@@ -74,7 +74,7 @@ def read_scan(path: str | Path, *, columns: int | None = None, reflectance_scale
         path: the file.
         columns: float32 values per point of a `.bin`; None: four (KITTI) or five (nuScenes), by the values.
         reflectance_scale: the stored value that is a reflectance of 1; auto: by the field's type and the values
-            (`decide_scale`). For a folder of scans decide it once: `stored_scans.folder_reflectance_scale`.
+            (`decide_scale`). For a folder of scans decide it once: `scan_settings.folder_reflectance_scale`.
 
     Raises:
         ScanError: the file is missing, damaged, too large or of an unknown format.

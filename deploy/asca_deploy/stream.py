@@ -45,7 +45,7 @@ def overlap_stages(
     `scans` is read in a thread of its own, so that reading files or waiting for a sensor overlaps too, and never more
     than one scan ahead of the one that is asked for. Closing the iterator waits for the stages that run, and for the
     scan if one is being read, and ends both threads. A source that may block forever has a method `interrupt`, which is
-    called first and lets its iterator end (`scan_queue.ScanQueue`). A program that ends with an open stream waits for
+    called first and lets its iterator end (`ScanQueue`). A program that ends with an open stream waits for
     the stages that run and for no scan.
 
     Args:

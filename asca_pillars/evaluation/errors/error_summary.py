@@ -127,7 +127,7 @@ _Mask = NDArray[np.bool_]
 class Spread(Strict):
     """Distribution of a quantity: number of values, median (of a share: the mean), 10th and 90th percentile.
 
-    `interval` is the median's (mean's) 95 % interval by `block_bootstrap`.
+    `interval` is the median's (mean's) 95 % interval over `bootstrap_samples`.
     """
 
     count: int

@@ -68,7 +68,7 @@ class PillarGrid(Strict):
     """K, the number of pillar depths."""
     map: Literal["warped", "pooled"] = "warped"
     """Map that the neck reads. `warped`: a column for every pillar along x, as the paper prints it. `pooled`: columns
-    as deep as the second zone's pillars everywhere, see `map_pooling`. With one zone both are the same."""
+    as deep as the second zone's pillars everywhere, see `pool_pillars`. With one zone both are the same."""
 
     def __post_init__(self) -> None:
         for name in ("x_range_m", "y_range_m", "z_range_m"):

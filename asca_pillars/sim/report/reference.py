@@ -148,7 +148,7 @@ class LabelStatistics(Strict):
 
 @dataclass(frozen=True)
 class Fit(Strict):
-    """Statistic of the fit of labels to points (`fit_statistics`), over the objects of one drive or folder.
+    """Statistic of the fit of labels to points (`object_fits`), over the objects of one drive or folder.
 
     Attributes:
         source: the drive or folder.

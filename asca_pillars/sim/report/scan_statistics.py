@@ -285,7 +285,7 @@ class ScanRecord:
         ground_sums: (3, 2, BANDS) number, sum and sum of squares of z and of reflectance of ground returns.
         reflectance: by material, (units, REFLECTANCES) counts of the scan or of each object in it.
         cars: (C, 2) range and points of its unoccluded, untruncated cars.
-        fits: by class, from `fit_statistics.object_fits`.
+        fits: by class, from `object_fits`.
     """
 
     points: int

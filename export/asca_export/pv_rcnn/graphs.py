@@ -99,7 +99,7 @@ class VoxelProducts(nn.Module):
 
 
 class RoundedVoxels:
-    """The backbone before and after its weights are rounded, see `rounded_backbones.RoundedBackbone`.
+    """The backbone before and after its weights are rounded, see `int8.RoundedBackbone`.
 
     Args:
         backbone: in evaluation mode; not modified.
