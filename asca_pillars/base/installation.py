@@ -59,7 +59,7 @@ EXTRAS = {
     "train": ("torch", "lightning", "onnx", "onnxscript", "tensorboard"),
     "openvino": ("openvino",),
     "eval": ("matplotlib",),
-    "import": ("pyarrow", "laspy"),
+    "import": ("pyarrow", "laspy", "lazrs"),
     "recordings": ("rosbags", "mcap"),
     "video": ("imageio_ffmpeg",),
     "view": ("rerun", "rosbags", "mcap"),
