@@ -21,12 +21,13 @@ def read_las(path: Path) -> StoredPoints:
 
     Raises:
         ScanError: not such a file, a damaged one, or one of too many points.
-        AscaError: laspy is not installed.
+        AscaError: laspy or lazrs is not installed.
     """
     try:
         import laspy
-    except ModuleNotFoundError:
-        raise AscaError(f"{path}: laspy not installed: {install_command('import')}") from None
+        import lazrs  # noqa: F401  with which laspy reads .laz
+    except ModuleNotFoundError as error:
+        raise AscaError(f"{path}: {error.name} not installed: {install_command('import')}") from None
     if not _records_fit(path):
         raise ScanError(f"{path}: not the header of a LAS file, or one of more records than the file holds; {AGAIN}")
     try:

@@ -65,7 +65,8 @@ def test_more_points_than_a_scan_has_are_refused_before_they_are_read(tmp_path, 
         read(tmp_path, "a.las", las())
 
 
-def test_without_laspy_the_command_that_installs_it_is_named(tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "laspy", None)
-    with pytest.raises(AscaError, match=r"laspy not installed: pip install .*import"):
+@pytest.mark.parametrize("module", ["laspy", "lazrs"])
+def test_without_laspy_the_command_that_installs_it_is_named(tmp_path, monkeypatch, module):
+    monkeypatch.setitem(sys.modules, module, None)
+    with pytest.raises(AscaError, match=rf"{module} not installed: pip install .*import"):
         read(tmp_path, "a.las", las())
