@@ -16,14 +16,15 @@ from asca_pillars.cli.options import (
     scan_settings,
 )
 from asca_pillars.cli.train import INTERRUPTED
+from asca_pillars.scans.find_scans import SCAN_SUFFIXES
 
 
 def adapt(
     scans: Annotated[
         Path,
         typer.Argument(
-            help="Folder of scans (.bin .npy .pcd .ply .las .laz .xyz .feather), or a recording (.mcap .db3 .bag "
-            ".pcap, a rosbag2 folder)."
+            help=f"Folder of scans ({' '.join(SCAN_SUFFIXES)}), or a recording (.mcap .db3 .bag .pcap, a rosbag2 "
+            "folder)."
         ),
     ],
     *,

@@ -7,12 +7,13 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from asca_pillars.base.errors import ConfigError
+from asca_pillars.scans.find_scans import NAMED_SUFFIXES, SCAN_SUFFIXES
 
 if TYPE_CHECKING:
     from asca_pillars.scans.scan_settings import ScanSettings
 
 _SCANS = (
-    "Scans (.bin .npy .pcd .ply .las .laz .xyz .feather; .csv .txt by name) and folders of them, searched to any depth"
+    f"Scans ({' '.join(SCAN_SUFFIXES)}; {' '.join(NAMED_SUFFIXES)} by name) and folders of them, searched to any depth"
 )
 ScansArgument = Annotated[
     list[Path] | None, typer.Argument(help=f"{_SCANS}. Default: the sample that comes with asca.")

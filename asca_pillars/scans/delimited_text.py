@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from asca_pillars.base.errors import ScanError
-from asca_pillars.scans.records import AGAIN, MAX_POINTS, Field, StoredPoints, assemble_points, select_fields
+from asca_pillars.scans.records import AGAIN, Field, StoredPoints, assemble_points, require_few_points, select_fields
 
 _UNIT = re.compile(r"\s*[(\[].*")
 _FIRST_COLUMNS = ("x", "y", "z", "intensity")
@@ -29,8 +29,7 @@ def read_delimited_text(path: Path) -> StoredPoints:
     """
     text = path.read_bytes().decode("utf-8-sig", errors="replace")
     names, lines = _split_header(path, [line for line in text.splitlines() if line.strip()])
-    if len(lines) > MAX_POINTS:
-        raise ScanError(f"{path}: {len(lines)} points are more than {MAX_POINTS}; cut the recording into scans")
+    require_few_points(str(path), len(lines))
     width = len(_values(lines[0])) if lines else len(names)
     remarks: tuple[str, ...] = ()
     if not names:
@@ -50,7 +49,8 @@ def _split_header(path: Path, lines: Sequence[str]) -> tuple[list[str], Sequence
     first = next((number for number, line in enumerate(lines) if _is_number(_values(line)[0])), len(lines))
     for number, line in enumerate(lines[:first]):
         words = [_UNIT.sub("", word.strip().strip("\"'").lower()) for word in _values(line.lstrip(" \t#/"))]
-        names = [word if (other := _ALIASES.get(word, word)) in words else other for word in words]
+        # VeloView's later files have both Points_m_XYZ:0 and X.
+        names = [word if _ALIASES.get(word) in words else _ALIASES.get(word, word) for word in words]
         if set("xyz") <= set(names):
             return names, lines[number + 1 :]
     if first == len(lines):

@@ -14,7 +14,7 @@ from asca_pillars.base.files import is_hidden, require_content
 
 SCAN_SUFFIXES = (".bin", ".npy", ".pcd", ".ply", ".las", ".laz", ".xyz", ".feather")
 NAMED_SUFFIXES = (".csv", ".txt")
-"""Of scans that are read where their files are named; in folders such files are labels, calibrations and lists."""
+"""Files with these suffixes are read if they are given by name; in folders they are labels, calibrations and lists."""
 PREPARED_FILE = "README.txt"
 PREPARED_NOTE = "Computed from the dataset by `asca prepare` or by a training run. Delete it when no run uses it.\n"
 """Text of the file that marks a folder computed from a dataset, which contains no scans."""

@@ -8,7 +8,7 @@ import numpy as np
 
 from asca_pillars.base.errors import AscaError, ScanError
 from asca_pillars.base.installation import install_command
-from asca_pillars.scans.records import AGAIN, MAX_POINTS, Field, StoredPoints, assemble_points
+from asca_pillars.scans.records import AGAIN, Field, StoredPoints, assemble_points, require_few_points
 
 _EARLIER_HEADER_BYTES, _HEADER_BYTES = 227, 375  # of LAS before and from version 1.4 on
 _VLR_BYTES, _EVLR_BYTES = 54, 60  # of a variable-length record's own header
@@ -33,18 +33,15 @@ def read_las(path: Path) -> StoredPoints:
     try:
         with laspy.open(path) as reader:
             header, count = reader.header, reader.header.point_count
-            least = header.offset_to_point_data + (
-                0 if header.are_points_compressed else count * header.point_format.size
-            )
-            if least > path.stat().st_size:
+            require_few_points(str(path), count)
+            room = path.stat().st_size - header.offset_to_point_data
+            if not header.are_points_compressed and count * header.point_format.size > room:
                 raise ValueError(f"{count} points do not fit into it")
-            points = reader.read() if count <= MAX_POINTS else None
-    except (OSError, MemoryError, KeyboardInterrupt):
+            points = reader.read()
+    except (ScanError, OSError, MemoryError, KeyboardInterrupt):
         raise
     except BaseException as error:  # damage shows in errors of laspy, struct and NumPy, and in panics of lazrs
         raise ScanError(f"{path}: not a readable LAS file ({' '.join(str(error).split())[:100]}); {AGAIN}") from error
-    if points is None:
-        raise ScanError(f"{path}: {count} points are more than {MAX_POINTS}; cut the recording into scans")
     if len(points) != count:
         raise ScanError(f"{path}: {len(points)} points where the header states {count}; {AGAIN}")
     with np.errstate(over="ignore", invalid="ignore"):

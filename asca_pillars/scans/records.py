@@ -48,6 +48,12 @@ class StoredPoints(NamedTuple):
     remarks: tuple[str, ...] = ()
 
 
+def require_few_points(source: str, count: int) -> None:
+    """Raise ScanError if there are more points than a scan has, MAX_POINTS."""
+    if count > MAX_POINTS:
+        raise ScanError(f"{source}: {count} points are more than {MAX_POINTS}; cut the recording into scans")
+
+
 def whole_number(word: str) -> int | None:
     """Parse a word of decimal digits; return None if it is anything else, or too long."""
     return int(word) if _DIGITS.fullmatch(word) else None
@@ -174,8 +180,7 @@ def points_from_array(array: NDArray[Any], source: str = "points") -> StoredPoin
         raise ScanError(
             f"{source}: holds {array.dtype} of shape {array.shape}; save real numbers of shape (N, 3) or (N, 4)"
         )
-    if len(array) > MAX_POINTS:
-        raise ScanError(f"{source}: {len(array)} points are more than {MAX_POINTS}; cut the recording into scans")
+    require_few_points(source, len(array))
     remarks: tuple[str, ...] = ()
     if isinstance(array, np.ma.MaskedArray):
         masked = np.ma.getmaskarray(array)[:, :4].any(axis=1)
@@ -189,13 +194,9 @@ def points_from_array(array: NDArray[Any], source: str = "points") -> StoredPoin
 
 def _points_from_records(array: NDArray[Any], source: str) -> StoredPoints:
     """Convert a structured array to points, such as those that ros_numpy and pypcd4 give."""
-    types = [array.dtype[name] for name in array.dtype.names or ()]
-    fields = [
-        Field(name, kind.base, math.prod(kind.shape)) for name, kind in zip(array.dtype.names or (), types, strict=True)
-    ]
+    fields = [Field(name, kind.base, math.prod(kind.shape)) for name, (kind, *_) in (array.dtype.fields or {}).items()]
     selected = [fields[index] for index in select_fields(source, fields)]
     if wrong := [field for field in selected if field.dtype.kind not in "iuf"]:
         raise ScanError(f"{source}: field {wrong[0].name} holds {wrong[0].dtype}; save real numbers")
-    if array.size > MAX_POINTS:
-        raise ScanError(f"{source}: {array.size} points are more than {MAX_POINTS}; cut the recording into scans")
+    require_few_points(source, array.size)
     return assemble_points(array.size, [array[field.name].reshape(-1) for field in selected], selected)

@@ -5,7 +5,9 @@ import struct
 from typing import Literal
 
 import numpy as np
+from hypothesis import strategies as st
 
+from asca_pillars.base.errors import ScanError
 from asca_pillars.scans.scan_reader import Scan, read_scan
 
 POINTS = np.array([[1.5, -2.25, 0.5, 0.25], [70.125, 39.5, -3, 1.0], [0, 0, 0, 0], [-5.0, 8.0, 1.0, 0.5]], np.float32)
@@ -94,6 +96,20 @@ def text(separator: str = " ", first: str = "", points=POINTS) -> bytes:
 def npy(array: np.ndarray) -> bytes:
     header = str({"descr": array.dtype.str, "fortran_order": False, "shape": array.shape}).encode() + b"\n"
     return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(header)) + header + array.tobytes()
+
+
+CHANGES = st.lists(st.tuples(st.integers(0, 10_000), st.integers(0, 255)), min_size=1, max_size=4)
+"""Positions in a file and bytes to write there."""
+
+
+def assert_scan_or_scan_error(folder, name: str, content: bytes, changes) -> None:
+    damaged = bytearray(content)
+    for position, value in changes:
+        damaged[position % len(damaged)] = value
+    try:
+        assert read(folder, name, bytes(damaged)).points.shape[1] == 4
+    except ScanError as error:
+        assert "\n" not in str(error)
 
 
 def read(tmp_path, name: str, content: bytes) -> Scan:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from asca_pillars.base.errors import ScanError
-from tests.scans.scan_files import POINTS, read
+from tests.scans.scan_files import read
 
 LIVOX = (
     "Version,Slot ID,LiDAR Index,Rsvd,Error Code,Timestamp Type,Data Type,Timestamp,X,Y,Z,Reflectivity,Tag,Ori_x\n"
@@ -62,9 +62,3 @@ def test_without_names_the_first_columns_are_x_y_z_and_the_reflectance(tmp_path,
 def test_what_is_no_table_of_points_is_refused(tmp_path, content, words):
     with pytest.raises(ScanError, match=words):
         read(tmp_path, "a.csv", content.encode())
-
-
-def test_a_table_of_whole_numbers_keeps_them(tmp_path):
-    content = "".join(f"{x} {y} {z} {100 * r}\n" for x, y, z, r in POINTS.tolist())
-    scan = read(tmp_path, "a.xyz", content.encode())
-    np.testing.assert_allclose(scan.points[:, 3], POINTS[:, 3] * 100 / 255, rtol=1e-6)
