@@ -47,7 +47,7 @@ def test_names_in_backticks_are_those_of_something() -> None:
 
 
 def _names_in_code() -> set[str]:
-    """Return all identifiers and short texts of the code, the identifiers of its tests, and the parts of files' names."""
+    """Return all identifiers and short texts of the code, identifiers of its tests, and the parts of files' names."""
     names: set[str] = set()
     for path in (
         path for folder in (*PACKAGES, "configs", "benchmarks", "tests", "examples") for path in Path(folder).rglob("*")
