@@ -92,6 +92,7 @@ class AugmentConfig(Strict):
         object_reflectance_gain: (lowest, highest) factor of each object's reflectance.
         object_jitter_m: standard deviation of the noise of each point of an object along x, y and z.
         object_cut_probability: of each object to lose a sector of azimuth or of elevation, as if partly hidden.
+        reflectance_gain: (lowest, highest) factor of the reflectance of all points, as other sensors scale it.
         reflectance_loss_probability: of a sample whose points lose their reflectance, some of them or all.
     """
 
@@ -107,6 +108,7 @@ class AugmentConfig(Strict):
     object_reflectance_gain: tuple[float, float] = (1.0, 1.0)
     object_jitter_m: float = 0.0
     object_cut_probability: float = 0.0
+    reflectance_gain: tuple[float, float] = (1.0, 1.0)
     reflectance_loss_probability: float = 0.0
 
     def __post_init__(self) -> None:
@@ -114,7 +116,7 @@ class AugmentConfig(Strict):
         require_bounds("augment", self, (*shares, "reflectance_loss_probability"), low=0, high=1)
         noise = ("rotation_rad", "shift_z_m", "object_rotation_rad", "object_shift_m", "object_jitter_m")
         require_bounds("augment", self, noise, low=0)
-        for name in ("scale", "object_reflectance_gain"):
+        for name in ("scale", "object_reflectance_gain", "reflectance_gain"):
             low, high = getattr(self, name)
             if not 0 < low <= high < math.inf:
                 raise ConfigError(f"augment.{name} = {[low, high]}: must be two positive numbers, the smaller first")

@@ -41,8 +41,7 @@ def corrupt_objects(
     Returns:
         (K, 4), K <= N, without the points that were cut out.
     """
-    low, high = config.object_reflectance_gain
-    brighten, shake = (low, high) != (1, 1), config.object_jitter_m > 0
+    brighten, shake = config.object_reflectance_gain != (1, 1), config.object_jitter_m > 0
     if not (brighten or shake or config.object_cut_probability):
         return points
     points = points.copy()
@@ -50,8 +49,7 @@ def corrupt_objects(
     for inside in points_in_boxes(points, boxes).T:
         indices = np.flatnonzero(inside)
         if brighten:
-            gain = np.exp(rng.uniform(np.log(low), np.log(high)))  # doubling is as likely as halving
-            points[indices, 3] = np.minimum(points[indices, 3] * gain, 1)
+            points[indices, 3] = _brightened(points[indices, 3], config.object_reflectance_gain, rng)
         if shake:
             points[indices, :3] += rng.normal(0, config.object_jitter_m, (len(indices), 3))
         if config.object_cut_probability and rng.random() < config.object_cut_probability:
@@ -62,11 +60,21 @@ def corrupt_objects(
     return points[kept]
 
 
-def drop_reflectance(points: NDArray[np.float32], config: AugmentConfig, rng: np.random.Generator) -> None:
-    """Overwrite the reflectance of some or all points (N, 4), in place, in some samples: some sensors report none.
+def _brightened(
+    reflectance: NDArray[np.float32], gain: tuple[float, float], rng: np.random.Generator
+) -> NDArray[np.float32]:
+    low, high = gain
+    factor = np.exp(rng.uniform(np.log(low), np.log(high)))  # doubling is as likely as halving
+    return np.minimum(reflectance * factor, 1).astype(np.float32)
 
-    Half of these samples get 0 for a random share of the points, the other half one value for all.
+
+def change_reflectance(points: NDArray[np.float32], config: AugmentConfig, rng: np.random.Generator) -> None:
+    """Scale the reflectance of all points (N, 4), in place, and overwrite it in some samples: some sensors report none.
+
+    Half of the overwritten samples get 0 for a random share of the points, the other half one value for all.
     """
+    if config.reflectance_gain != (1, 1):
+        points[:, 3] = _brightened(points[:, 3], config.reflectance_gain, rng)
     if not config.reflectance_loss_probability or rng.random() >= config.reflectance_loss_probability:
         return
     if rng.random() < 0.5:
@@ -115,7 +123,7 @@ def augment(
     frame = replace(frame, points=frame.points.copy(), boxes=frame.boxes.copy())
     move_objects(frame, config, rng)
     frame = replace(frame, points=corrupt_objects(frame.points, frame.boxes, config, rng, sensor_m))
-    drop_reflectance(frame.points, config, rng)
+    change_reflectance(frame.points, config, rng)
     motion = Motion(
         flipped=rng.random() < config.flip_probability,
         rotation_rad=rng.uniform(-config.rotation_rad, config.rotation_rad),

@@ -183,6 +183,7 @@ SHARES = (
         ("model.loss.assigner", "max_iou", "input should be 'overlap' or 'atss'"),
         ("augment.rotation_rad", ".inf", "should be a finite number"),
         ("augment.object_reflectance_gain", "[2, 0.5]", "must be two positive numbers, the smaller first"),
+        ("augment.reflectance_gain", "[0, 2]", "must be two positive numbers, the smaller first"),
         ("augment.scale", "[1.05, 0.95]", "must be two positive numbers, the smaller first"),
         ("augment.scale", "[0, 1]", "must be two positive numbers, the smaller first"),
         ("augment.scale", "[.nan, 1]", "should be a finite number"),

@@ -15,8 +15,8 @@ from asca_pillars.config.tree import AugmentConfig
 from asca_pillars.data.augment import (
     FEWEST_POINTS,
     augment,
+    change_reflectance,
     corrupt_objects,
-    drop_reflectance,
     flip_y,
     move_objects,
     rotate,
@@ -272,7 +272,7 @@ def test_off_draws_nothing() -> None:
     rng = np.random.default_rng(0)
     assert corrupt_objects(POINTS, BOXES, AugmentConfig(), rng) is POINTS
     points = POINTS.copy()
-    drop_reflectance(points, AugmentConfig(), rng)
+    change_reflectance(points, AugmentConfig(), rng)
     assert np.array_equal(points, POINTS)
     assert rng.bit_generator.state == np.random.default_rng(0).bit_generator.state
 
@@ -338,13 +338,28 @@ def test_reflectance_is_lost_in_part_or_is_one_value() -> None:
     bright[:, 3] = np.linspace(0.2, 0.9, len(bright))
     for seed in range(200):
         points = bright.copy()
-        drop_reflectance(points, corrupting(reflectance_loss_probability=0.5), np.random.default_rng(seed))
+        change_reflectance(points, corrupting(reflectance_loss_probability=0.5), np.random.default_rng(seed))
         assert np.array_equal(points[:, :3], bright[:, :3])
         same += np.array_equal(points, bright)
         constant += np.ptp(points[:, 3]) == 0
         some += bool((points[:, 3] == 0).any() and np.isin(points[:, 3], [0, *bright[:, 3]]).all())
     assert same == pytest.approx(100, abs=25) and constant == pytest.approx(50, abs=20)
     assert some == pytest.approx(50, abs=20)
+
+
+def test_all_points_have_one_gain() -> None:
+    before = POINTS.copy()
+    before[:, 3] = np.linspace(0, 0.6, len(before))
+    gains = []
+    for seed in range(300):
+        points = before.copy()
+        change_reflectance(points, corrupting(reflectance_gain=(0.5, 2.0)), np.random.default_rng(seed))
+        assert np.array_equal(points[:, :3], before[:, :3]) and points[:, 3].max() <= 1
+        gain = points[1, 3] / before[1, 3]
+        np.testing.assert_allclose(points[:, 3], np.minimum(before[:, 3] * gain, 1), rtol=1e-5)
+        gains.append(gain)
+    assert min(gains) == pytest.approx(0.5, abs=0.05) and max(gains) == pytest.approx(2, abs=0.1)
+    assert np.mean(np.array(gains) > 1) == pytest.approx(0.5, abs=0.1)
 
 
 def test_a_cut_is_that_of_the_sensor_wherever_the_origin_is() -> None:
