@@ -49,7 +49,7 @@ def corrupt_objects(
     for inside in points_in_boxes(points, boxes).T:
         indices = np.flatnonzero(inside)
         if brighten:
-            points[indices, 3] = _brightened(points[indices, 3], config.object_reflectance_gain, rng)
+            points[indices, 3] = _with_random_gain(points[indices, 3], config.object_reflectance_gain, rng)
         if shake:
             points[indices, :3] += rng.normal(0, config.object_jitter_m, (len(indices), 3))
         if config.object_cut_probability and rng.random() < config.object_cut_probability:
@@ -60,7 +60,7 @@ def corrupt_objects(
     return points[kept]
 
 
-def _brightened(
+def _with_random_gain(
     reflectance: NDArray[np.float32], gain: tuple[float, float], rng: np.random.Generator
 ) -> NDArray[np.float32]:
     low, high = gain
@@ -74,7 +74,7 @@ def change_reflectance(points: NDArray[np.float32], config: AugmentConfig, rng: 
     Half of the overwritten samples get 0 for a random share of the points, the other half one value for all.
     """
     if config.reflectance_gain != (1, 1):
-        points[:, 3] = _brightened(points[:, 3], config.reflectance_gain, rng)
+        points[:, 3] = _with_random_gain(points[:, 3], config.reflectance_gain, rng)
     if not config.reflectance_loss_probability or rng.random() >= config.reflectance_loss_probability:
         return
     if rng.random() < 0.5:

@@ -362,6 +362,13 @@ def test_all_points_have_one_gain() -> None:
     assert np.mean(np.array(gains) > 1) == pytest.approx(0.5, abs=0.1)
 
 
+def test_a_frame_gets_the_gain() -> None:
+    points, boxes, _ = make_scene(0)
+    frame = frame_of(boxes, points)
+    found = augment(frame, replace(STILL, reflectance_gain=(0.5, 0.5)), np.random.default_rng(0))
+    np.testing.assert_allclose(found.points, frame.points * [1, 1, 1, 0.5], rtol=1e-6)
+
+
 def test_a_cut_is_that_of_the_sensor_wherever_the_origin_is() -> None:
     """Points of a vehicle's frame, whose sensor stands on its roof, lose what those of the sensor's own frame lose."""
     cut, sensor_m = corrupting(object_cut_probability=1.0), (1.5, 0.25, 2.0)
