@@ -111,6 +111,8 @@ def _band_or_none(values: Floats) -> Band | None:
 
 WINDOW_RETURNS = "window_returns"
 """Points per height on side windows over those on the doors below them; cars neither end-on nor side-on."""
+DOOR_ZEROS, UPPER_ZEROS = "door_zeros", "upper_zeros"
+"""Share of points without a reflectance on doors or tail, and above them: windows, their frames, pillars; any view."""
 SHOWN: Mapping[str, tuple[str, ...]] = {
     "Car": (
         "flank_end",
@@ -123,11 +125,14 @@ SHOWN: Mapping[str, tuple[str, ...]] = {
         "top",
         "low_inside",
         WINDOW_RETURNS,
+        DOOR_ZEROS,
+        UPPER_ZEROS,
     ),
     "Pedestrian": ("range_5", "range_50", "range_95", "range_spread"),
     "Cyclist": ("range_5", "range_50", "range_95", "range_spread"),
 }
-COLUMNS = (*STATISTICS, WINDOW_RETURNS)
+OF_CARS = (WINDOW_RETURNS, DOOR_ZEROS, UPPER_ZEROS)
+COLUMNS = (*STATISTICS, *OF_CARS)
 MEANS = ("low_inside",)  # fractions of objects, for which a median is meaningless
 MIN_OBJECTS = 2
 _MAX_TRUNCATION = 0.1
@@ -137,6 +142,11 @@ _WINDOWS, _DOORS = (0.68, 0.82), (0.35, 0.55)  # fractions of the height
 _BESIDE_FRONT_SEATS = -0.25, 0.05  # fractions of the length ahead of the center
 _FLANK_M = 0.3
 _MIN_DOOR_POINTS = 9
+_ZEROS_RANGE_M = 40.0
+_UPPER = 0.65, 0.85  # fractions of the height; the doors are those of the windows
+_MIN_BAND_POINTS = 5
+_LEAST_REFLECTANCE = 0.01  # KITTI's step
+_AROUND_M = 0.1  # points so far beside a label are its car's, too
 
 
 def object_fits(
@@ -145,7 +155,7 @@ def object_fits(
     """Return `COLUMNS` of the unoccluded, untruncated objects of each class, (objects, len(COLUMNS)).
 
     Args:
-        points: (N, >=3) points of the scan, metres.
+        points: (N, >=4) points of the scan, metres and reflectance.
         objects: M labels with a 3D box.
         boxes: (M, 7) their boxes in the frame of the points.
     """
@@ -154,21 +164,42 @@ def object_fits(
     samples = {}
     for name in CLASSES:
         of_class = boxes[whole & (names == name)] if len(objects) else boxes[:0]
-        windows = [window_returns(points, box.astype(np.float64)) if name == "Car" else np.nan for box in of_class]
-        samples[name] = np.column_stack([label_fit(points, of_class), windows]).reshape(-1, len(COLUMNS))
+        of_cars = np.full((len(of_class), len(OF_CARS)), np.nan)
+        if name == "Car":
+            for row, box in zip(of_cars, of_class.astype(np.float64), strict=True):
+                row[:] = window_returns(points, box), *zero_shares(points, box)
+        samples[name] = np.column_stack([label_fit(points, of_class), of_cars])
     return samples
+
+
+def zero_shares(points: NDArray[np.floating], box: Floats) -> tuple[float, float]:
+    """Return `DOOR_ZEROS` and `UPPER_ZEROS` of a car's box (7,) from points (N, >=4); NaN where there are too few."""
+    if np.hypot(box[0], box[1]) > _ZEROS_RANGE_M:
+        return float("nan"), float("nan")
+    along, across, up = _in_box(points, box)
+    on_car = (np.abs(along) < box[3] / 2 + _AROUND_M) & (np.abs(across) < box[4] / 2 + _AROUND_M)
+    bands = [points[on_car & (up > low) & (up < high), 3] for low, high in (_DOORS, _UPPER)]
+    doors, upper = (
+        float((of < _LEAST_REFLECTANCE).mean()) if len(of) >= _MIN_BAND_POINTS else float("nan") for of in bands
+    )
+    return doors, upper
+
+
+def _in_box(points: NDArray[np.floating], box: Floats) -> tuple[Floats, Floats, Floats]:
+    """Return how far points are along and across a box (7,), metres from its center, and up, fraction of its height."""
+    offset, yaw = points[:, :2].astype(np.float64) - box[:2], box[6]
+    up = (points[:, 2] - box[2]) / box[5] + 0.5
+    return offset @ (np.cos(yaw), np.sin(yaw)), offset @ (-np.sin(yaw), np.cos(yaw)), up
 
 
 def window_returns(points: NDArray[np.floating], box: Floats) -> float:
     """Return `WINDOW_RETURNS` of a car's box (7,), or NaN if too little of its doors is visible."""
-    x, y, z, length, width, height, yaw = box
-    if np.hypot(x, y) > _WINDOW_RANGE_M or not _WINDOW_VIEW_DEG[0] < view_angle_deg(box[None])[0] < _WINDOW_VIEW_DEG[1]:
+    view_deg = view_angle_deg(box[None])[0]
+    if np.hypot(box[0], box[1]) > _WINDOW_RANGE_M or not _WINDOW_VIEW_DEG[0] < view_deg < _WINDOW_VIEW_DEG[1]:
         return float("nan")
-    offset = points[:, :2].astype(np.float64) - box[:2]
-    along, across = offset @ (np.cos(yaw), np.sin(yaw)) / length, np.abs(offset @ (-np.sin(yaw), np.cos(yaw)))
-    up = (points[:, 2] - z) / height + 0.5
-    first, last = _BESIDE_FRONT_SEATS
-    flank = (along > first) & (along < last) & (across > width / 2 - _FLANK_M) & (across < width / 2 + _FLANK_M)
+    along, across, up = _in_box(points, box)
+    first, last = np.multiply(_BESIDE_FRONT_SEATS, box[3])
+    flank = (along > first) & (along < last) & (np.abs(np.abs(across) - box[4] / 2) < _FLANK_M)
     windows, doors = (int((flank & (up > low) & (up < high)).sum()) for low, high in (_WINDOWS, _DOORS))
     if doors < _MIN_DOOR_POINTS:
         return float("nan")

@@ -1,11 +1,14 @@
 """How labels lie around points, on cars and people made of a few planes."""
 
+import os
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from asca_pillars.data.kitti import objects_from_boxes
+from asca_pillars.data.kitti import KittiSplit, boxes_from_objects, objects_3d, objects_from_boxes
+from asca_pillars.scans.scan_reader import read_scan
 from asca_pillars.sim.report.comparison import Measured, compare
 from asca_pillars.sim.report.reference import CLASSES, Fit, kitti_reference
 from asca_pillars.sim.report.scan_statistics import (
@@ -15,6 +18,7 @@ from asca_pillars.sim.report.scan_statistics import (
     fits_of,
     object_fits,
     window_returns,
+    zero_shares,
 )
 from asca_pillars.sim.report.tables import fits_table
 from tests.helpers.scenes import CALIBRATION
@@ -41,15 +45,31 @@ def test_windows_are_measured_against_the_doors_below_them(share: float) -> None
     assert found == pytest.approx(share, rel=0.1)
 
 
+@pytest.mark.parametrize("yaw", [0.0, 0.9, -2.2])
+def test_points_without_reflectance_are_counted_on_doors_and_above_them(yaw: float) -> None:
+    box = [12.0, 4.0, -0.9, 4.0, 1.7, 1.5, yaw]
+    points = flank(box, 1.0)
+    up = (points[:, 2] - box[2]) / box[5] + 0.5
+    reflectance = np.where(up > 0.6, 0.0, 0.3)
+    reflectance[::4] = 0.004  # KITTI's step is 0.01
+    on_car = np.column_stack([points, reflectance])
+    scan = np.concatenate([on_car, on_car * (1, 1, 1, 0) + np.array([5.0, 5.0, 0.0, 0.3])])
+    assert zero_shares(scan, np.array(box)) == pytest.approx((0.25, 1.0), abs=0.02)
+
+
 def test_what_cannot_be_measured_is_left_out() -> None:
     for box in ([12.0, 0.0, -0.9, 4.0, 1.7, 1.5, 0.05], [30.0, 4.0, -0.9, 4.0, 1.7, 1.5, 0.9]):
         assert np.isnan(window_returns(flank(box, 1.0), np.array(box)))
+    far = [45.0, 4.0, -0.9, 4.0, 1.7, 1.5, 0.9]
+    for box, step in ((far, 1), ([12.0, *far[1:]], 2000)):
+        points = flank(box, 1.0)[::step]
+        assert np.isnan(zero_shares(np.column_stack([points, np.zeros(len(points))]), np.array(box))).all()
     box = [12.0, 4.0, -0.9, 4.0, 1.7, 1.5, 0.9]
     assert np.isnan(window_returns(flank(box, 1.0)[::2000], np.array(box))), "too few points to tell"
     boxes = np.array([[10.0, 3.0, -0.8, 0.8, 0.6, 1.7, 0.0]] * 3)
     objects = objects_from_boxes(boxes, ["Pedestrian", "Pedestrian", "Cyclist"], CALIBRATION)
     rng = np.random.default_rng(0)
-    points = rng.uniform((9.7, 2.8, -1.5), (9.9, 3.2, -0.2), (300, 3))  # on the sensor's side of the box
+    points = rng.uniform((9.7, 2.8, -1.5, 0.0), (9.9, 3.2, -0.2, 1.0), (300, 4))  # on the sensor's side of the box
     objects = [replace(item, occluded=hidden, truncated=0.0) for item, hidden in zip(objects, (0, 1, 0), strict=True)]
     found = object_fits(points, objects, boxes)
     assert {name: len(rows) for name, rows in found.items()} == {"Car": 0, "Pedestrian": 1, "Cyclist": 1}
@@ -86,3 +106,28 @@ def test_a_set_may_be_as_far_off_as_the_drives_are_from_each_other() -> None:
         assert (width.within is False) is missed and width.bar == pytest.approx(0.04, abs=0.011)
         people = next(row for row in rows if row.name == "Pedestrian range_50")
         assert people.within is None and people.measure == "difference", "two drives bound nothing"
+
+
+def test_the_reference_is_what_the_code_measures_on_real_frames() -> None:
+    """A statistic that changes after the reference was measured compares unlike things."""
+    root = os.environ.get("ASCA_KITTI_MINI")
+    if not root:
+        pytest.skip("ASCA_KITTI_MINI is not set: no real scans here")
+    split = KittiSplit(Path(root))
+    rows = []
+    for frame_id in split.frame_ids:
+        objects = objects_3d(split.objects(frame_id))
+        boxes = boxes_from_objects(objects, split.calibration(frame_id))
+        rows.append(object_fits(read_scan(split.scan_path(frame_id)).points, objects, boxes))
+    measured = fits_of({name: np.concatenate([row[name] for row in rows]) for name in CLASSES}, "single frames")
+    reference = {
+        name: fit
+        for name, fits in kitti_reference().statistics.label_fit.items()
+        for fit in fits
+        if fit.source == "single frames"
+    }
+    assert set(measured) == set(reference)
+    for name, fit in reference.items():
+        found = measured[name][0]
+        assert found.objects == fit.objects, name
+        assert (found.middle, found.low, found.high) == pytest.approx((fit.middle, fit.low, fit.high), abs=6e-4), name
