@@ -109,7 +109,7 @@ class SceneConfig(Strict):
     behind_gaps: float = 0.4  # fraction of vehicles with a narrow object behind their ends
     thick_trunks: float = 0.45  # fraction of trees with a trunk of 0.35 to 0.6 m that widens towards its roots
     crown_density_per_m: tuple[float, float] = (0.15, 1.8)
-    dark_paint_share: float = 0.38
+    dark_paint_share: float = 0.25
 
     # An object with fewer returns in the image is marked DontCare, a hardly visible one too.
     min_points: int = 2

@@ -31,6 +31,7 @@ def _unit_wheel() -> Floats:
 
 
 _WHEEL = _unit_wheel()
+GLASS = 0.03  # reflectance of what windows return, mostly too weak for the sensor to report
 _LID = ((1.0, 1.0), (0.85, 0.66), (0.45, 0.2), (0.0, 0.0))  # across hood and roof: fraction of half width, of the crown
 
 
@@ -129,9 +130,9 @@ def _shell(hull: _Hull, paint: Paint, trim: Surface, rng: np.random.Generator) -
     """Return the left half of a body: corners (Q,4,3) and surfaces (Q,3)."""
     profile, top = hull.profile, np.array(hull.profile.top)
     # A pane reflects specularly the light that it does not transmit: most windows of KITTI's cars are holes.
-    pane = Surface(0.05, 15.0, float(rng.uniform(0.1, 0.7)))
+    pane = Surface(GLASS, 15.0, float(rng.uniform(0.1, 0.7)))
     # Side windows are dirty or tinted, or the outline lacks a frame: half as many returns as from a door.
-    window = Surface(0.05, float(np.exp(rng.uniform(np.log(0.3), np.log(12.0)))), float(rng.uniform(0.05, 0.6)))
+    window = Surface(GLASS, float(np.exp(rng.uniform(np.log(0.3), np.log(12.0)))), float(rng.uniform(0.05, 0.6)))
     arch = (hull.wheel_radius + 0.06) / hull.length
     arches = (hull.wheel_x[:, None] + np.array([-1.0, -0.8, -0.4, 0.4, 0.8, 1.0]) * arch).ravel()
     low = np.unique(np.concatenate([[0.0, 0.02, 0.05], arches, [0.95, 0.98, 1.0]]).clip(0, 1))
@@ -143,7 +144,9 @@ def _shell(hull: _Hull, paint: Paint, trim: Surface, rng: np.random.Generator) -
 
     middle = (high[:-1] + high[1:]) / 2
     raised = np.interp(middle, top[:, 0], top[:, 1]) > profile.belt + 0.08
-    in_cabin = (middle > profile.cabin[0]) & (middle < profile.cabin[1]) & raised & (np.abs(middle - post) > 0.018)
+    in_window = (middle > profile.cabin[0]) & (middle < profile.cabin[1]) & raised & (np.abs(middle - post) > 0.018)
+    # Behind the side windows of vans and pickups there is a painted wall, behind those of cars a pillar.
+    framed = raised & ((middle < profile.cabin[1]) | (profile.cabin[1] > 0.7))
     in_pane = np.zeros(len(middle), bool)
     for begin, end in profile.glass:
         in_pane |= (middle > begin) & (middle < end)
@@ -152,7 +155,9 @@ def _shell(hull: _Hull, paint: Paint, trim: Surface, rng: np.random.Generator) -
     table = np.empty((len(middle), 6, 3))
     table[:, :3] = paint.upright.row
     table[:, 3:] = np.where(steep[:, None, None], paint.upright.row, paint.flat.row)
-    table[in_cabin, 1] = window.row
+    table[framed, 1:3] = paint.frame.row
+    table[framed & steep, 3:] = paint.frame.row
+    table[in_window, 1] = window.row
     table[in_pane, 4:] = pane.row
     skirt = np.broadcast_to(paint.upright.row, (len(low) - 1, 3))
     ends = [_end(hull, x, sections[at]) for x, at in ((0.0, 0), (1.0, -1))]

@@ -11,7 +11,14 @@ from asca_pillars.evaluation.errors.label_fit import label_fit
 from asca_pillars.sim.bodies.people import SHARES, bicycle, cyclist_body, draw_burden, pedestrian_body
 from asca_pillars.sim.bodies.styles import draw_style
 from asca_pillars.sim.bodies.vehicles import car_body
-from asca_pillars.sim.report.scan_statistics import COLUMNS, WINDOW_RETURNS, window_returns
+from asca_pillars.sim.report.scan_statistics import (
+    COLUMNS,
+    DOOR_ZEROS,
+    UPPER_ZEROS,
+    WINDOW_RETURNS,
+    window_returns,
+    zero_shares,
+)
 from asca_pillars.sim.scene_config import SceneConfig
 from asca_pillars.sim.world.placement import Target
 from asca_pillars.sim.world.scene import BEAM_M_PER_M, body_of
@@ -80,6 +87,14 @@ def test_cars_shine_have_low_windows_and_end_where_those_of_kitti_do() -> None:
     assert 0.35 < np.nanmedian(windows) < 1.1
 
 
+@pytest.mark.parametrize("yaw_rad", [0.2, 0.8, 1.5])
+def test_windows_and_their_frames_are_too_dark_for_a_report_and_doors_less_often(yaw_rad: float) -> None:
+    """KITTI's medians by drive: 0.82 to 1.0 above the doors, 0.2 to 0.7 on them."""
+    fits = dict(zip(COLUMNS, label_fits(yaw_rad, 20.0).T, strict=True))
+    assert np.nanmedian(fits[UPPER_ZEROS]) > 0.65
+    assert 0.15 < np.nanmean(fits[DOOR_ZEROS]) < 0.6
+
+
 def label_fits(yaw_rad: float, distance_m: float) -> np.ndarray:
     """Statistics (24, columns) of cars 1.5 m left of straight ahead, as their labels would have them."""
     rows = []
@@ -87,12 +102,12 @@ def label_fits(yaw_rad: float, distance_m: float) -> np.ndarray:
         rng = np.random.default_rng(seed)
         target = Target("Car", np.array([distance_m, 1.5, 0.75, 3.9, 1.63, 1.5, 0.0]))
         body = body_of(target, SceneConfig(), rng).placed(-distance_m, -1.5, 0.0, 0.0)
-        seen = view(body, distance_m, yaw_rad, seed)[:, :3]
+        seen = view(body, distance_m, yaw_rad, seed)
         cos, sin = np.cos(yaw_rad), np.sin(yaw_rad)
         x, y = seen[:, 0] * cos - seen[:, 1] * sin + distance_m, seen[:, 0] * sin + seen[:, 1] * cos
         box = np.array([distance_m, 0.0, 0.75, 3.9, 1.63, 1.5, yaw_rad])
-        points = np.column_stack([x, y, seen[:, 2]])
-        rows.append([*label_fit(points, box[None])[0], window_returns(points, box)])
+        points = np.column_stack([x, y, seen[:, 2:]])
+        rows.append([*label_fit(points, box[None])[0], window_returns(points, box), *zero_shares(points, box)])
     return np.array(rows)
 
 
