@@ -188,41 +188,35 @@ def _varied(profile: Profile, bonnet: float, rng: np.random.Generator) -> Profil
 
 @dataclass(frozen=True)
 class Paint:
-    """Paint of upright panels, of hood and roof, which rays graze, and of the frames of the windows.
-
-    The scatter of hood and roof is weak but not zero. Frames are black, or curved away from the sensor.
-    """
+    """Paint of upright panels, and of hood and roof, which rays graze: their scatter is weak but not zero."""
 
     upright: Surface
     flat: Surface
-    frame: Surface
+
+    @property
+    def frame(self) -> Surface:
+        """Pillars and frames of windows: black, or curved away from the sensor."""
+        return Surface(max(0.1 * self.upright.reflectance, 0.025), 0.4)
 
 
 def draw_paint(rng: np.random.Generator, dark_share: float = 0.5) -> Paint:
     """Return paint: dark, metallic or pale.
 
-    Dark paint reflects at normal incidence and hardly anywhere else. Metallic paint is bright near by, and too weak
-    for the sensor's report farther away. Pale paint with a matte pigment reflects well from any side, others hardly at
-    grazing incidence.
+    Dark paint reflects at normal incidence and hardly anywhere else. Metallic paint is bright at short range, and
+    farther away too weak for the sensor to report. Pale paint with a matte pigment reflects well from any side, others
+    hardly at grazing incidence.
     """
     if rng.random() < dark_share:
         upright = _draw_surface(rng, (0.015, 0.04), (0.4, 1.6))
     elif rng.random() < METALLIC_SHARE:
         upright = _draw_surface(rng, (0.03, 0.2), (0.3, 1.2))
     elif rng.random() < PALE_SHARE:
-        upright, flat = Surface(float(rng.uniform(0.35, 0.65)), 0.1), Surface(float(rng.uniform(0.2, 0.45)), 0.2)
-        return Paint(upright, flat, _frame(upright))
+        return Paint(Surface(float(rng.uniform(0.35, 0.65)), 0.1), Surface(float(rng.uniform(0.2, 0.45)), 0.2))
     else:
         upright = _draw_surface(rng, (0.22, 0.55), (0.1, 0.6))
-    return Paint(
-        upright, Surface(max(0.1 * upright.reflectance, 0.012), float(rng.uniform(0.25, 0.6))), _frame(upright)
-    )
+    return Paint(upright, Surface(max(0.1 * upright.reflectance, 0.012), float(rng.uniform(0.25, 0.6))))
 
 
 def _draw_surface(rng: np.random.Generator, reflectance: tuple[float, float], gloss: tuple[float, float]) -> Surface:
     """Return a surface within these bounds; the logarithm of its reflectance is uniformly distributed."""
     return Surface(float(np.exp(rng.uniform(*np.log(reflectance)))), float(rng.uniform(*gloss)))
-
-
-def _frame(upright: Surface) -> Surface:
-    return Surface(max(0.1 * upright.reflectance, 0.025), 0.4)

@@ -91,7 +91,7 @@ def test_cars_shine_have_low_windows_and_end_where_those_of_kitti_do() -> None:
 def test_windows_and_their_frames_are_too_dark_for_a_report_and_doors_less_often(yaw_rad: float) -> None:
     """KITTI's medians by drive: 0.82 to 1.0 above the doors, 0.2 to 0.7 on them."""
     fits = dict(zip(COLUMNS, label_fits(yaw_rad, 20.0).T, strict=True))
-    assert np.nanmedian(fits[UPPER_ZEROS]) > 0.65
+    assert np.nanmedian(fits[UPPER_ZEROS]) > 0.72
     assert 0.15 < np.nanmean(fits[DOOR_ZEROS]) < 0.6
 
 
